@@ -1,0 +1,1 @@
+"""physai: the shortest trustworthy way from a simulated robot arm to a policy on a ROS 2 robot."""

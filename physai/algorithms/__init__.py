@@ -1,0 +1,5 @@
+"""Learning from collected frames."""
+
+from physai.algorithms.on_policy import NonFiniteError, OnPolicy
+
+__all__ = ["NonFiniteError", "OnPolicy"]

@@ -1,0 +1,216 @@
+"""Composing and checking configuration: values live in ``conf/``, types and ranges in the models that inherit Config."""
+
+import difflib
+import importlib
+import inspect
+import re
+import typing
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Annotated, Any, TypeVar
+
+from hydra import compose as hydra_compose
+from hydra import initialize_config_dir
+from hydra.errors import HydraException, MissingConfigException, OverrideParseException
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    PydanticSchemaGenerationError,
+    PydanticUndefinedAnnotation,
+    TypeAdapter,
+    ValidationError,
+)
+
+from physai.errors import UserError
+
+
+class Config(BaseModel):
+    """Base of all config models: no unknown keys, no silent conversions, no changes, and no defaults."""
+
+    model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
+
+
+def _whole(value: Any) -> Any:
+    """Let people write 1e6 for a count."""
+    return int(value) if isinstance(value, float) and value.is_integer() else value
+
+
+Count = Annotated[int, BeforeValidator(_whole), Field(gt=0)]
+PositiveFloat = Annotated[float, Field(gt=0)]
+NonNegativeFloat = Annotated[float, Field(ge=0)]
+
+C = TypeVar("C", bound=Config)
+
+
+def _ceil_div(number: Any, divisor: Any) -> int:
+    """Resolver ``${ceil_div:a,b}``; nonsense gives 1, for the key that holds it gets the blame when it is validated."""
+    try:
+        return max(1, -(-int(number) // int(divisor)))
+    except (TypeError, ValueError, ZeroDivisionError):
+        return 1
+
+
+OmegaConf.register_new_resolver("ceil_div", _ceil_div)
+
+
+def conf_dir() -> Path:
+    """Return the folder of the YAML files: inside the installed package, or beside it in a checkout."""
+    inside = Path(__file__).parent / "conf"
+    return inside if inside.is_dir() else Path(__file__).parent.parent / "conf"
+
+
+def compose(name: str, overrides: Iterable[str] = (), hydra: bool = False) -> DictConfig:
+    """Compose ``conf/<name>.yaml`` with Hydra overrides.
+
+    Args:
+        name: A file in ``conf/``, without its ending.
+        overrides: As on the command line, such as ``env=reacher`` or ``algo.optimizer.lr=1e-3``.
+        hydra: Keep the ``hydra`` node.
+
+    Raises:
+        UserError: If an override is no override, or names a group, option or key that does not exist.
+    """
+    overrides = list(overrides)
+    with initialize_config_dir(str(conf_dir().absolute()), version_base="1.3"):
+        try:
+            return hydra_compose(name, overrides, return_hydra_config=hydra)
+        except MissingConfigException as error:
+            wanted = str(error.missing_cfg_file).rpartition("/")[2]
+            raise UserError(f"{error.missing_cfg_file}: no such config{nearest(wanted, error.options or [])}") from None
+        except OverrideParseException as error:
+            raise UserError(f"'{error.override}' is not an override such as key=value") from None
+        except (HydraException, OmegaConfBaseException) as error:
+            match = re.search(r"Could not (?:override|append to config|delete from config)[^']*'([^'=]+)", str(error))
+            if match is None:
+                match = re.search(r"Key '([^']+)'", str(error))
+            if match is None or not overrides:
+                raise UserError(" ".join(str(error).split())) from None
+            key = match[1].split("@")[0]
+            raise UserError(f"unknown key '{key}'{nearest(key, _keys(hydra_compose(name)))}") from None
+
+
+def validate(model: type[C], node: DictConfig) -> C:
+    """Turn a composed config into its typed model.
+
+    Raises:
+        UserError: One line that names the first bad key, what was expected, and what came.
+    """
+    try:
+        data = OmegaConf.to_container(node, resolve=True, throw_on_missing=True)
+    except OmegaConfBaseException as error:
+        raise UserError(" ".join(str(error).split())) from None
+    try:
+        return model.model_validate(data)
+    except ValidationError as error:
+        first = error.errors()[0]
+        key = ".".join(str(part) for part in first["loc"])
+        if first["type"] == "extra_forbidden":
+            keys = [name for name in _keys(node) if name != key and not name.startswith(f"{key}.")]
+            raise UserError(f"unknown key '{key}'{nearest(key, keys)}") from None
+        if first["type"] == "missing":
+            raise UserError(f"{key} is missing") from None
+        if first["type"] == "value_error" and isinstance(first["ctx"]["error"], UserError | ValueError):
+            raise UserError(f"{key}{first['ctx']['error']}") from None
+        message = first["msg"][0].lower() + first["msg"][1:]
+        raise UserError(f"{key}: {message}, got {first['input']!r}") from None
+
+
+def nearest(name: str, options: Iterable[str]) -> str:
+    """End of an error message: the option that the user most likely meant, or the options if they are few."""
+    options = sorted(set(options))
+    by_last = {option.rpartition(".")[2]: option for option in options}
+    close = difflib.get_close_matches(name, options, n=1, cutoff=0.7)
+    if not close:
+        close = [by_last[last] for last in difflib.get_close_matches(name.rpartition(".")[2], by_last, n=1)]
+    if close:
+        return f"; did you mean '{close[0]}'?"
+    return f"; there are: {', '.join(options)}" if 0 < len(options) <= 12 else ""
+
+
+def _keys(node: DictConfig, prefix: str = "") -> list[str]:
+    keys = []
+    for key in node:
+        keys.append(f"{prefix}{key}")
+        if not OmegaConf.is_missing(node, key) and isinstance(node._get_node(key), DictConfig):
+            child = node._get_node(key)
+            if child is not None and not child._is_none():
+                keys += _keys(child, f"{prefix}{key}.")
+    return keys
+
+
+def _check_target(node: dict[str, Any], path: str = "") -> dict[str, Any]:
+    """Check the keys and simple values of a ``_target_`` node against the signature of what it names."""
+    name = node.get("_target_")
+    if not isinstance(name, str):
+        raise ValueError(f"{path}: a _target_ is needed, such as torch.optim.Adam")
+    target = _import(name, path)
+    hints, is_open = _parameters(target)
+    for key, value in node.items():
+        if key in ("_target_", "_partial_"):
+            continue
+        if key not in hints and not is_open:
+            raise ValueError(f": unknown key '{path.lstrip('.')}{'.' if path else ''}{key}' of {name}{nearest(key, hints)}")
+        if isinstance(value, Mapping) and "_target_" in value:
+            _check_target(dict(value), f"{path}.{key}")
+        else:
+            _check_value(hints.get(key, Any), value, f"{path}.{key}")
+    return node
+
+
+def _import(name: str, path: str) -> Any:
+    module, _, attribute = name.rpartition(".")
+    while module:
+        try:
+            found = importlib.import_module(module)
+        except ModuleNotFoundError:
+            outer, _, inner = module.rpartition(".")
+            module, attribute = outer, f"{inner}.{attribute}"
+            continue
+        try:
+            for part in attribute.split("."):
+                found = getattr(found, part)
+        except AttributeError:
+            raise ValueError(f"{path}._target_: {module} has no '{attribute}'{nearest(attribute, dir(found))}") from None
+        return found
+    raise ValueError(f"{path}._target_: there is no '{name}'")
+
+
+def _parameters(target: Any) -> tuple[dict[str, Any], bool]:
+    """Names and types of the keyword arguments, those that ``**kwargs`` hands on to base classes included."""
+    functions = [vars(base)["__init__"] for base in target.__mro__ if "__init__" in vars(base)] if inspect.isclass(
+        target
+    ) else [target]
+    hints: dict[str, Any] = {}
+    for function in functions:
+        parameters = inspect.signature(function).parameters.values()
+        try:
+            types = typing.get_type_hints(function, include_extras=True)
+        except (NameError, TypeError):
+            types = {}
+        for parameter in parameters:
+            if parameter.name != "self" and parameter.kind not in (parameter.VAR_KEYWORD, parameter.VAR_POSITIONAL):
+                hints.setdefault(parameter.name, types.get(parameter.name, Any))
+        if not any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters):
+            return hints, False
+    return hints, not inspect.isclass(target)
+
+
+def _check_value(hint: Any, value: Any, path: str) -> None:
+    try:
+        adapter = TypeAdapter(hint, config=ConfigDict(arbitrary_types_allowed=True))
+    except (PydanticSchemaGenerationError, PydanticUndefinedAnnotation, TypeError):
+        return
+    try:
+        adapter.validate_python(value)
+    except ValidationError as error:
+        message = error.errors()[0]["msg"]
+        raise ValueError(f"{path}: {message[0].lower()}{message[1:]}, got {value!r}") from None
+
+
+Target = Annotated[dict[str, Any], AfterValidator(_check_target)]
+"""A node for ``hydra.utils.instantiate``: whatever it names must exist and accept the keys that are given."""

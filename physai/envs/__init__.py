@@ -1,0 +1,1 @@
+"""Environments: one simulation core, a TorchRL shell and Gymnasium shells."""

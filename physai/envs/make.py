@@ -1,0 +1,92 @@
+"""The one place where an environment and its transforms are put together."""
+
+from torch import Tensor
+from torchrl.envs import TransformedEnv
+from torchrl.envs.transforms import Compose, Transform
+
+from physai.config import Config, PositiveFloat
+from physai.envs.robot_env import RobotEnv
+from physai.envs.simulation import EnvConfig, Simulation
+from physai.seeding import derive
+from physai.transforms import (
+    ActuatorDelay,
+    DomainRandomization,
+    Observation,
+    ObservationNormalization,
+    RandomizationConfig,
+    SensorModel,
+)
+from physai.transforms.stochastic import StochasticTransform
+
+
+class NormalizationConfig(Config):
+    """How observations are normalized."""
+
+    eps: PositiveFloat
+    clip: PositiveFloat
+
+
+class TransformedRobotEnv(TransformedEnv):
+    """A RobotEnv with its transforms: seeded as one, and with a state that restores it bit for bit."""
+
+    @property
+    def simulation(self) -> Simulation:
+        """The robots."""
+        return self.base_env.simulation
+
+    @property
+    def normalization(self) -> ObservationNormalization:
+        """The transform that holds the statistics."""
+        return next(t for t in self.transform if isinstance(t, ObservationNormalization))
+
+    def set_seed(self, seed: int | None = None, static_seed: bool = False) -> int | None:
+        """Seed goals and starts, and each transform with a seed of its own."""
+        seed = 0 if seed is None else seed
+        self.simulation.seed(derive(seed, "task"))
+        for transform in self.transform:
+            if isinstance(transform, StochasticTransform):
+                transform.seed(derive(seed, type(transform).__name__))
+        return seed if static_seed else seed + 1
+
+    def state(self) -> dict[str, dict[str, Tensor]]:
+        """Return the state of robots, episodes, transforms and random numbers."""
+        return {"simulation": self.simulation.state(), "transforms": dict(self.transform.state_dict())}
+
+    def set_state(self, state: dict[str, dict[str, Tensor]]) -> None:
+        """Restore what ``state`` returned, in an env made from the same config."""
+        self.simulation.set_state(state["simulation"])
+        self.transform.load_state_dict(state["transforms"])
+
+
+def make_env(
+    env: EnvConfig,
+    randomization: RandomizationConfig,
+    normalization: NormalizationConfig,
+    num_envs: int,
+    seed: int,
+) -> TransformedRobotEnv:
+    """Put N robots, their randomization, sensors, observation and its normalization together.
+
+    Args:
+        env: Robot and task.
+        randomization: What differs from robot to robot and from episode to episode.
+        normalization: How observations are normalized.
+        num_envs: N.
+        seed: Seeds every source of randomness in the env.
+    """
+    base = RobotEnv(env, num_envs)
+    layout, task = base.simulation.layout, base.simulation.task
+    joints = len(base.simulation.spec.joints)
+    transforms: list[Transform] = []
+    if randomization.draws:
+        transforms.append(DomainRandomization(randomization, layout, num_envs, 0))
+    if randomization.max_delay:
+        transforms.append(ActuatorDelay(layout, num_envs, joints, randomization.max_delay))
+    if randomization.affects("encoder_offset", "position_noise", "velocity_noise"):
+        transforms.append(SensorModel(layout, 0))
+    size = task.observation_size(joints)
+    transforms.append(Observation(task.observation(base.simulation.kinematics), size))
+    transforms.append(ObservationNormalization(size, normalization.eps, normalization.clip))
+    made = TransformedRobotEnv(base, Compose(*transforms))
+    made.set_seed(seed)
+    return made

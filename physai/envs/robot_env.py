@@ -1,0 +1,87 @@
+"""The TorchRL shell: N robots as one natively batched environment."""
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torchrl.data import Binary, Bounded, Composite, Unbounded
+from torchrl.envs import EnvBase
+
+from physai.envs.simulation import EnvConfig, Simulation
+
+
+class RobotEnv(EnvBase):
+    """N robots at a task, ``batch_size=[N]``.
+
+    It speaks of what a robot senses (``joint_position``, ``joint_velocity``, ``goal``) and leaves what a policy sees to the
+    transforms. Beside them: ``physics_parameters`` (see :class:`physai.physics.ParameterLayout`; read at reset, when given),
+    ``episode_length`` and ``episode_return``. Only the rows of ``_reset`` are reset.
+
+    Args:
+        config: The environment.
+        num_envs: Number of robots, N.
+        seed: Seeds goals and start poses.
+    """
+
+    def __init__(self, config: EnvConfig, num_envs: int, seed: int = 0) -> None:
+        super().__init__(device="cpu", batch_size=[num_envs])
+        self.simulation = Simulation(config, num_envs, seed)
+        joints = len(self.simulation.spec.joints)
+        goal, parameters = self.simulation.task.goal_size, len(self.simulation.layout.nominal)
+
+        def unbounded(size: int, dtype: torch.dtype = torch.float32) -> Unbounded:
+            return Unbounded(shape=(num_envs, size), dtype=dtype)
+
+        self.observation_spec = Composite(
+            joint_position=unbounded(joints),
+            joint_velocity=unbounded(joints),
+            goal=unbounded(goal),
+            physics_parameters=unbounded(parameters),
+            episode_length=unbounded(1, torch.int64),
+            episode_return=unbounded(1),
+            shape=[num_envs],
+        )
+        self.action_spec = Bounded(-1.0, 1.0, shape=(num_envs, joints), dtype=torch.float32)
+        self.reward_spec = unbounded(1)
+        self.done_spec = Composite(
+            {key: Binary(1, shape=(num_envs, 1), dtype=torch.bool) for key in ("done", "terminated", "truncated")},
+            shape=[num_envs],
+        )
+
+    def _observe(self) -> dict[str, torch.Tensor]:
+        simulation = self.simulation
+        return {
+            "joint_position": simulation.joint_position,
+            "joint_velocity": simulation.joint_velocity,
+            "goal": simulation.goal,
+            "physics_parameters": simulation.parameters,
+            "episode_length": simulation.episode_length,
+            "episode_return": simulation.episode_return,
+        }
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **_: object) -> TensorDict:
+        rows = parameters = None
+        if tensordict is not None:
+            mask = tensordict.get("_reset", None)
+            rows = None if mask is None else mask[:, 0]
+            parameters = tensordict.get("physics_parameters", None)
+        self.simulation.reset(rows, parameters)
+        false = torch.zeros(self.num_robots, 1, dtype=torch.bool)
+        done = {"done": false, "terminated": false.clone(), "truncated": false.clone()}
+        return TensorDict({**self._observe(), **done}, batch_size=self.batch_size)
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDict:
+        reward, terminated, truncated = self.simulation.step(tensordict.get("action"))
+        done = {"done": terminated | truncated, "terminated": terminated, "truncated": truncated}
+        return TensorDict({**self._observe(), "reward": reward, **done}, batch_size=self.batch_size)
+
+    @property
+    def num_robots(self) -> int:
+        """N."""
+        return self.batch_size[0]
+
+    def _set_seed(self, seed: int | None) -> None:
+        self.simulation.seed(0 if seed is None else seed)
+
+    def close(self, *, raise_if_closed: bool = True) -> None:
+        """Free the physics engine."""
+        super().close(raise_if_closed=raise_if_closed)
+        self.simulation.close()

@@ -1,0 +1,206 @@
+"""PyBullet as a batch of robots: several small worlds in one process, each a DIRECT client of its own."""
+
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pybullet as bullet
+from lxml import etree
+
+from physai.errors import UserError
+from physai.physics.interface import DynamicsParameters, nominal_dynamics
+from physai.robots import RobotSpec, urdf
+
+ROBOTS_PER_WORLD = 16  # the cost of a world grows faster than its robots; 16 is the fastest
+_FIXED_BASE = dict(useFixedBase=True, flags=bullet.URDF_USE_INERTIA_FROM_FILE)
+
+
+@dataclass(frozen=True)
+class _World:
+    client: int
+    bodies: list[int]
+
+
+class PyBulletPhysics:
+    """N velocity-controlled robots with a fixed base, in free space under gravity (see :class:`physai.physics.Physics`).
+
+    Joints that the spec does not control are welded at zero, and shapes are left out: nothing touches anything here, so the
+    state of a robot is its joint positions and velocities.
+
+    Each joint is driven by PyBullet's velocity motor with a limited effort. Coulomb friction has no counterpart in
+    PyBullet's motors; it takes its share of the effort when the motor speeds a joint up, and helps when it brakes.
+
+    Args:
+        spec: The robot.
+        num_robots: How many, N.
+        control_dt: Control period, s.
+        substeps: Physics steps per control period.
+
+    Raises:
+        UserError: If PyBullet refuses the URDF, or has no room for so many worlds.
+    """
+
+    def __init__(self, spec: RobotSpec, num_robots: int, control_dt: float, substeps: int = 1) -> None:
+        self.num_robots = num_robots
+        self.substeps = substeps
+        self._spec = spec
+        self._worlds: list[_World] = []
+        try:
+            with tempfile.TemporaryDirectory(prefix="physai-") as folder:
+                model = _model_for_physics(spec, Path(folder))
+                for first in range(0, num_robots, ROBOTS_PER_WORLD):
+                    robots = min(ROBOTS_PER_WORLD, num_robots - first)
+                    self._worlds.append(_make_world(spec, model, robots, control_dt / substeps))
+        except UserError:
+            self.close()
+            raise
+        joints, links, masses = _indices(self._worlds[0], spec)
+        self._joints: list[int] = joints
+        self._links: list[int] = links
+        self._unit_inertia = masses
+        self._tip = spec.moving_links.index(spec.end_effector)
+        self._row = [(world.client, body) for world in self._worlds for body in world.bodies]
+        n = len(joints)
+        self._position, self._velocity = np.zeros((num_robots, n)), np.zeros((num_robots, n))
+        self._parameters = {
+            key: np.repeat(value, num_robots, axis=0) for key, value in nominal_dynamics(spec).items()
+        }
+        self.reset(np.arange(num_robots), np.tile(spec.home, (num_robots, 1)), np.zeros((num_robots, n)), self._parameters)
+
+    def reset(
+        self,
+        rows: np.ndarray,
+        joint_position: np.ndarray,
+        joint_velocity: np.ndarray,
+        parameters: DynamicsParameters | None = None,
+    ) -> None:
+        """See :meth:`physai.physics.Physics.reset`."""
+        self._position[rows], self._velocity[rows] = joint_position, joint_velocity
+        for row, q, qd in zip(rows.tolist(), joint_position.tolist(), joint_velocity.tolist(), strict=True):
+            client, body = self._row[row]
+            for joint, position, velocity in zip(self._joints, q, qd, strict=True):
+                bullet.resetJointState(body, joint, position, velocity, client)
+        if parameters is not None:
+            self._set_parameters(rows, parameters)
+
+    def _set_parameters(self, rows: np.ndarray, parameters: DynamicsParameters) -> None:
+        for key, value in parameters.items():
+            self._parameters[key][rows] = value
+        mass = self._parameters["link_mass"][rows].copy()
+        mass[:, self._tip] += self._parameters["payload"][rows, 0]
+        damping = self._parameters["joint_damping"][rows]
+        for row, masses, dampings in zip(rows.tolist(), mass.tolist(), damping.tolist(), strict=True):
+            client, body = self._row[row]
+            for link, link_mass, (xx, yy, zz) in zip(self._links, masses, self._unit_inertia, strict=True):
+                bullet.changeDynamics(
+                    body,
+                    link,
+                    mass=link_mass,
+                    localInertiaDiagonal=(xx * link_mass, yy * link_mass, zz * link_mass),
+                    physicsClientId=client,
+                )
+            for joint, value in zip(self._joints, dampings, strict=True):
+                bullet.changeDynamics(body, joint, jointDamping=value, physicsClientId=client)
+
+    def step(self, velocity_command: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """See :meth:`physai.physics.Physics.step`."""
+        effort = self._available_effort(velocity_command)
+        targets, efforts = velocity_command.tolist(), effort.tolist()
+        gains = self._parameters["velocity_gain"].tolist()
+        command, read, joints = bullet.setJointMotorControl2, bullet.getJointStates, self._joints
+        mode = bullet.VELOCITY_CONTROL
+        states = []
+        row = 0
+        for world in self._worlds:
+            client = world.client
+            for body in world.bodies:
+                for joint, target, limit, gain in zip(joints, targets[row], efforts[row], gains[row]):  # noqa: B905
+                    command(body, joint, mode, 0.0, target, limit, 0.1, gain, 0.0, client)
+                row += 1
+            for _ in range(self.substeps):
+                bullet.stepSimulation(client)
+            for body in world.bodies:
+                states.append([state[:2] for state in read(body, joints, client)])
+        state = np.array(states)
+        self._position, self._velocity = state[..., 0].copy(), state[..., 1].copy()
+        return self._position.copy(), self._velocity.copy()
+
+    def _available_effort(self, command: np.ndarray) -> np.ndarray:
+        limit, friction = self._parameters["effort_limit"], self._parameters["joint_friction"]
+        braking = (command * self._velocity >= 0) & (np.abs(command) < np.abs(self._velocity))
+        return np.maximum(limit + np.where(braking, friction, -friction), 0.0)
+
+    def joint_state(self) -> tuple[np.ndarray, np.ndarray]:
+        """See :meth:`physai.physics.Physics.joint_state`."""
+        return self._position.copy(), self._velocity.copy()
+
+    def parameters(self) -> DynamicsParameters:
+        """Masses and damping as PyBullet holds them; effort, friction and gain as every step hands them to the motors."""
+        parameters = {key: value.copy() for key, value in self._parameters.items()}
+        for row, (client, body) in enumerate(self._row):
+            masses = np.array([bullet.getDynamicsInfo(body, link, client)[0] for link in self._links])
+            masses[self._tip] -= parameters["payload"][row, 0]
+            parameters["link_mass"][row] = masses
+            parameters["joint_damping"][row] = [bullet.getJointInfo(body, joint, client)[6] for joint in self._joints]
+        return parameters
+
+    def state(self) -> dict[str, np.ndarray]:
+        """See :meth:`physai.physics.Physics.state`."""
+        return {"joint_position": self._position.copy(), "joint_velocity": self._velocity.copy(), **self._parameters}
+
+    def set_state(self, state: dict[str, np.ndarray]) -> None:
+        """See :meth:`physai.physics.Physics.set_state`."""
+        parameters = {key: state[key] for key in self._parameters}
+        self.reset(np.arange(self.num_robots), state["joint_position"], state["joint_velocity"], parameters)
+
+    def close(self) -> None:
+        """Disconnect all clients."""
+        while self._worlds:
+            bullet.disconnect(self._worlds.pop().client)
+
+
+def _model_for_physics(spec: RobotSpec, folder: Path) -> Path:
+    """Write the URDF without shapes and with the uncontrolled joints welded at zero."""
+    tree = urdf.parse(spec.urdf)
+    for link in tree.iter("link"):
+        for shape in link.findall("visual") + link.findall("collision"):
+            link.remove(shape)
+    for joint in tree.iter("joint"):
+        if joint.get("name") not in spec.joints and joint.getparent().tag == "robot":
+            joint.set("type", "fixed")
+    path = folder / "robot.urdf"
+    tree.write(path, encoding="utf-8", xml_declaration=True)
+    return path
+
+
+def _make_world(spec: RobotSpec, model: Path, robots: int, time_step: float) -> _World:
+    client = bullet.connect(bullet.DIRECT)
+    if client < 0:
+        raise UserError("PyBullet has no room for another world in this process (it holds 1,024)")
+    bullet.setTimeStep(time_step, client)
+    bullet.setGravity(0, 0, -9.81, client)
+    try:
+        bodies = [bullet.loadURDF(str(model), physicsClientId=client, **_FIXED_BASE) for _ in range(robots)]
+    except bullet.error as error:
+        bullet.disconnect(client)
+        raise UserError(f"{spec.urdf}: PyBullet cannot load it: {error}") from None
+    for body in bodies:
+        for link in range(-1, bullet.getNumJoints(body, client)):
+            # The damping that counts is that of the joints.
+            bullet.changeDynamics(body, link, linearDamping=0, angularDamping=0, physicsClientId=client)
+            # Even shapeless robots share a broadphase; solved in one island, a robot would feel its neighbours' rounding.
+            bullet.setCollisionFilterGroupMask(body, link, 0, 0, client)
+    return _World(client, bodies)
+
+
+def _indices(world: _World, spec: RobotSpec) -> tuple[list[int], list[int], list[tuple[float, float, float]]]:
+    """PyBullet's indices of the joints and links of the spec, and the links' inertia per kg."""
+    body, client = world.bodies[0], world.client
+    infos = [bullet.getJointInfo(body, joint, client) for joint in range(bullet.getNumJoints(body, client))]
+    joints = {info[1].decode(): info[0] for info in infos}
+    links = {info[12].decode(): info[0] for info in infos}
+    moving = [links[name] for name in spec.moving_links]
+    dynamics = [bullet.getDynamicsInfo(body, link, client) for link in moving]
+    unit_inertia = [tuple(moment / info[0] for moment in info[2]) for info in dynamics]
+    return [joints[name] for name in spec.joints], moving, unit_inertia

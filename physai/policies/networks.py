@@ -1,0 +1,140 @@
+"""Multilayer perceptrons that act and judge."""
+
+import importlib
+from collections.abc import Sequence
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor, nn
+from torch.distributions import Distribution, Independent, Normal
+from torchrl.data import Composite
+from torchrl.envs.utils import ExplorationType, exploration_type
+
+from physai.config import Count, PositiveFloat, nearest
+from physai.errors import UserError
+
+
+def input_size(observation_spec: Composite, in_keys: Sequence[str], where: str) -> int:
+    """Return how many numbers ``in_keys`` of an env bring, or raise a UserError that says where a key is wrong."""
+    for key in in_keys:
+        if key not in observation_spec.keys():
+            raise UserError(f"{where}.in_keys: the env gives no '{key}'{nearest(key, observation_spec.keys())}")
+    return sum(observation_spec[key].shape[-1] for key in in_keys)
+
+
+def mlp(in_features: int, hidden_sizes: Sequence[int], out_features: int, activation: str) -> nn.Sequential:
+    """Build a perceptron with orthogonal weights (Saxe et al., 2014) and zero biases."""
+    module, _, name = activation.rpartition(".")
+    nonlinearity = getattr(importlib.import_module(module or "torch.nn"), name)
+    layers: list[nn.Module] = []
+    for size in hidden_sizes:
+        layers += [_linear(in_features, size, 2**0.5), nonlinearity()]
+        in_features = size
+    return nn.Sequential(*layers, _linear(in_features, out_features, 1.0))
+
+
+def _linear(in_features: int, out_features: int, gain: float) -> nn.Linear:
+    layer = nn.Linear(in_features, out_features)
+    nn.init.orthogonal_(layer.weight, gain)
+    nn.init.zeros_(layer.bias)
+    return layer
+
+
+class GaussianActor(TensorDictModuleBase):
+    """Draws ``latent_action`` from a diagonal normal distribution and acts with ``action = tanh(latent_action)``.
+
+    Learning on the latent sample is the same policy gradient as on the squashed one, for the change of variables has no
+    parameters and cancels in the probability ratio; but it has an exact log-probability where tanh saturates, and a
+    closed-form entropy. In the deterministic exploration mode the latent action is the mean.
+
+    Writes ``action`` [.., n] in (-1, 1), ``latent_action`` [.., n] and ``action_log_prob`` [..] (that of the latent action).
+
+    Args:
+        in_features: Numbers that ``in_keys`` bring.
+        action_size: n.
+        in_keys: Keys that the actor sees.
+        hidden_sizes: Widths of the hidden layers.
+        activation: A ``torch.nn`` module's name.
+        initial_std: Standard deviation of the first policy.
+    """
+
+    out_keys = ("action", "latent_action", "action_log_prob")
+    loss_keys = {"action": "latent_action", "sample_log_prob": "action_log_prob"}  # noqa: RUF012
+
+    def __init__(
+        self,
+        in_features: int,
+        action_size: int,
+        in_keys: list[str],
+        angle_keys: list[str],
+        hidden_sizes: list[Count],
+        activation: str,
+        initial_std: PositiveFloat,
+    ) -> None:
+        super().__init__()
+        self.in_keys = [*in_keys, *angle_keys]
+        self._plain = len(in_keys)
+        self.network = mlp(in_features, hidden_sizes, action_size, activation)
+        nn.init.orthogonal_(self.network[-1].weight, 0.01)  # start near zero velocity
+        self.log_std = nn.Parameter(torch.full((action_size,), initial_std).log())
+
+    def mean(self, tensordict: TensorDictBase) -> Tensor:
+        """Mean of the latent action, [.., n]."""
+        return self.network(_inputs(tensordict, self.in_keys, self._plain))
+
+    def get_dist(self, tensordict: TensorDictBase) -> Distribution:
+        """Return the distribution of the latent action."""
+        mean = self.mean(tensordict)
+        return Independent(Normal(mean, self.log_std.exp().expand_as(mean), validate_args=False), 1, validate_args=False)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Act."""
+        mean = self.mean(tensordict)
+        noise = torch.randn_like(mean) if exploration_type() == ExplorationType.RANDOM else torch.zeros_like(mean)
+        latent = mean + self.log_std.exp() * noise
+        log_prob = (-0.5 * noise.square() - self.log_std - _HALF_LOG_TWO_PI).sum(-1)
+        tensordict.set("action", torch.tanh(latent))
+        tensordict.set("latent_action", latent)
+        return tensordict.set("action_log_prob", log_prob)
+
+
+_HALF_LOG_TWO_PI = 0.9189385332046727
+
+
+class Critic(TensorDictModuleBase):
+    """Writes ``state_value`` [.., 1], the expected return.
+
+    Args:
+        in_features: Numbers that ``in_keys`` bring.
+        in_keys: Keys that the critic sees; ``physics_parameters`` among them make it a privileged one.
+        hidden_sizes: Widths of the hidden layers.
+        activation: A ``torch.nn`` module's name.
+    """
+
+    out_keys = ("state_value",)
+
+    def __init__(
+        self,
+        in_features: int,
+        in_keys: list[str],
+        angle_keys: list[str],
+        hidden_sizes: list[Count],
+        activation: str,
+    ) -> None:
+        super().__init__()
+        self.in_keys = [*in_keys, *angle_keys]
+        self._plain = len(in_keys)
+        self.network = mlp(in_features, hidden_sizes, 1, activation)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Judge."""
+        return tensordict.set("state_value", self.network(_inputs(tensordict, self.in_keys, self._plain)))
+
+
+def _inputs(tensordict: TensorDictBase, in_keys: Sequence[str], plain: int) -> Tensor:
+    values = []
+    for index, key in enumerate(in_keys):
+        value = tensordict.get(key)
+        values += [value] if index < plain else [torch.sin(value), torch.cos(value)]
+    return values[0] if len(values) == 1 else torch.cat(values, dim=-1)

@@ -1,0 +1,6 @@
+"""What a robot is: its URDF, its limits, its kinematics."""
+
+from physai.robots.kinematics import ForwardKinematics
+from physai.robots.spec import RobotConfig, RobotSpec
+
+__all__ = ["ForwardKinematics", "RobotConfig", "RobotSpec"]

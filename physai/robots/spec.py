@@ -1,0 +1,154 @@
+"""What a robot is, read once from ``conf/robot/*.yaml`` and the URDF that it names."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import yourdfpy
+from pydantic import Field
+
+from physai.config import Config, nearest
+from physai.errors import UserError
+from physai.robots import urdf
+
+
+class RobotConfig(Config):
+    """One file of ``conf/robot``."""
+
+    name: str
+    urdf: str
+    joints: list[str] = Field(min_length=1)
+    end_effector: str
+    home: list[float]
+
+
+@dataclass(frozen=True)
+class RobotSpec:
+    """A robot's URDF, its controlled joints, and their limits; arrays follow the order of ``joints``.
+
+    Attributes:
+        name: The robot's name.
+        urdf: Path of the URDF file.
+        joints: Names of the n controlled joints.
+        end_effector: Name of the link that reaches.
+        home: Rest pose, rad, [n].
+        position_limit: Lower and upper limit, rad, [n, 2]; infinite for continuous joints.
+        velocity_limit: rad/s, [n].
+        effort_limit: N·m, [n].
+        damping: N·m·s/rad, [n].
+        friction: Coulomb friction, N·m, [n].
+        chain: Joints from the base to the end effector, in order.
+        moving_links: Links with mass that the controlled joints move.
+        link_mass: Masses of ``moving_links``, kg.
+    """
+
+    name: str
+    urdf: Path
+    joints: tuple[str, ...]
+    end_effector: str
+    home: np.ndarray
+    position_limit: np.ndarray
+    velocity_limit: np.ndarray
+    effort_limit: np.ndarray
+    damping: np.ndarray
+    friction: np.ndarray
+    chain: tuple[yourdfpy.Joint, ...]
+    moving_links: tuple[str, ...]
+    link_mass: np.ndarray
+
+    @classmethod
+    def from_config(cls, config: RobotConfig) -> "RobotSpec":
+        """Read the URDF and check that it has what the config names.
+
+        Raises:
+            UserError: If the URDF is missing or broken, or lacks a joint, link or limit; the line names it.
+        """
+        path = urdf.resolve(config.urdf)
+        urdf.parse(path)
+        robot = urdf.load(path).robot
+        links = {link.name: link for link in robot.links}
+        by_child = {joint.child: joint for joint in robot.joints}
+
+        if config.end_effector not in links:
+            raise UserError(f"{path}: no link '{config.end_effector}'{nearest(config.end_effector, links)}")
+        chain = _chain(path, config.end_effector, by_child)
+        by_name = {joint.name: joint for joint in robot.joints}
+        for name in config.joints:
+            if name not in by_name:
+                raise UserError(f"{path}: no joint '{name}'{nearest(name, by_name)}")
+        for name in {name for name in config.joints if config.joints.count(name) > 1}:
+            raise UserError(f"{path}: joint '{name}' is named twice in the robot's joints")
+        on_chain = [joint.name for joint in chain if joint.name in config.joints]
+        if on_chain != list(config.joints):
+            raise UserError(
+                f"{path}: the joints must lie on the way from the base to '{config.end_effector}', in that order: "
+                f"{on_chain}, not {list(config.joints)}"
+            )
+        joints = [by_name[name] for name in config.joints]
+        for joint in joints:
+            _check_driven(path, joint)
+        if len(config.home) != len(joints):
+            raise UserError(f"robot '{config.name}': home has {len(config.home)} values for {len(joints)} joints")
+
+        moving = [links[link] for link in _links_below(config.joints[0], robot.joints, by_name)]
+        for link in moving:
+            if link.inertial is None or not link.inertial.mass:
+                raise UserError(f"{path}: link '{link.name}' moves but has no <inertial> with a mass")
+            if link.inertial.inertia is None or not np.linalg.eigvalsh(link.inertial.inertia)[0] > 0:
+                raise UserError(f"{path}: link '{link.name}' moves but its inertia is not positive")
+        return cls(
+            name=config.name,
+            urdf=path,
+            joints=tuple(config.joints),
+            end_effector=config.end_effector,
+            home=np.array(config.home, dtype=np.float64),
+            position_limit=np.array([_position_limit(joint) for joint in joints]),
+            velocity_limit=np.array([joint.limit.velocity for joint in joints], dtype=np.float64),
+            effort_limit=np.array([joint.limit.effort for joint in joints], dtype=np.float64),
+            damping=np.array([_dynamics(joint, "damping") for joint in joints]),
+            friction=np.array([_dynamics(joint, "friction") for joint in joints]),
+            chain=tuple(chain),
+            moving_links=tuple(link.name for link in moving),
+            link_mass=np.array([link.inertial.mass for link in moving], dtype=np.float64),
+        )
+
+
+def _chain(path: Path, link: str, by_child: dict[str, yourdfpy.Joint]) -> list[yourdfpy.Joint]:
+    chain: list[yourdfpy.Joint] = []
+    while link in by_child:
+        joint = by_child[link]
+        if joint in chain:
+            raise UserError(f"{path}: joint '{joint.name}' is part of a loop")
+        chain.insert(0, joint)
+        link = joint.parent
+    return chain
+
+
+def _links_below(joint: str, joints: list[yourdfpy.Joint], by_name: dict[str, yourdfpy.Joint]) -> list[str]:
+    below = [by_name[joint].child]
+    for link in below:
+        below += [other.child for other in joints if other.parent == link]
+    return below
+
+
+def _check_driven(path: Path, joint: yourdfpy.Joint) -> None:
+    where = f"{path}: joint '{joint.name}'"
+    if joint.type not in ("revolute", "continuous"):
+        raise UserError(f"{where} is {joint.type}: only revolute and continuous joints can be driven")
+    if joint.limit is None:
+        raise UserError(f"{where} has no <limit>: effort and velocity are needed")
+    if not (joint.limit.effort or 0) > 0 or not (joint.limit.velocity or 0) > 0:
+        raise UserError(f"{where}: the effort and velocity of its <limit> must be positive")
+    lower, upper = _position_limit(joint)
+    if lower >= upper:
+        raise UserError(f"{where}: its lower limit {lower:g} is not below its upper limit {upper:g}")
+
+
+def _position_limit(joint: yourdfpy.Joint) -> tuple[float, float]:
+    if joint.type == "continuous":
+        return -np.inf, np.inf
+    return float(joint.limit.lower or 0), float(joint.limit.upper or 0)
+
+
+def _dynamics(joint: yourdfpy.Joint, key: str) -> float:
+    return float(getattr(joint.dynamics, key, None) or 0)

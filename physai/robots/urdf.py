@@ -1,0 +1,115 @@
+"""Reading a URDF: yourdfpy does the parsing, this module finds what it lets pass and names the culprit."""
+
+import importlib.resources
+import logging
+import math
+from pathlib import Path
+
+import numpy as np
+import yourdfpy
+from lxml import etree
+
+from physai.errors import UserError
+
+_NUMERIC = {
+    "mass": ["value"],
+    "inertia": ["ixx", "ixy", "ixz", "iyy", "iyz", "izz"],
+    "origin": ["xyz", "rpy"],
+    "axis": ["xyz"],
+    "limit": ["lower", "upper", "effort", "velocity"],
+    "dynamics": ["damping", "friction"],
+}
+
+
+def resolve(uri: str) -> Path:
+    """Return the file that ``package://<python package>/<path>``, or a plain path, stands for.
+
+    Raises:
+        UserError: If the package or the file does not exist.
+    """
+    path = Path(uri).expanduser()
+    if uri.startswith("package://"):
+        package, _, inside = uri.removeprefix("package://").partition("/")
+        try:
+            path = Path(str(importlib.resources.files(package))) / inside
+        except ModuleNotFoundError:
+            raise UserError(f"{uri}: there is no Python package '{package}' here") from None
+    if not path.is_file():
+        raise UserError(f"{uri}: no such URDF file ({path})")
+    return path.resolve()
+
+
+def parse(path: Path) -> etree._ElementTree:
+    """Read the XML of a URDF and check what any robot needs, whatever it will be used for.
+
+    Raises:
+        UserError: If the XML is broken, a number is none, or a link or joint contradicts itself.
+    """
+    try:
+        tree = etree.parse(path, etree.XMLParser(remove_comments=True))
+    except etree.XMLSyntaxError as error:
+        raise UserError(f"{path}: not well-formed XML: {error.msg}") from None
+    root = tree.getroot()
+    if root.tag != "robot" or "name" not in root.attrib:
+        raise UserError(f"{path}: the top element must be <robot name=...>, found <{root.tag}>")
+    links = [_named(path, link) for link in root.findall("link")]
+    for name in {name for name in links if links.count(name) > 1}:
+        raise UserError(f"{path}: link '{name}' is defined twice")
+    for link in root.findall("link"):
+        _check_numbers(path, link)
+        _check_inertial(path, link)
+    for joint in root.findall("joint"):
+        _check_numbers(path, joint)
+        name = _named(path, joint)
+        for end in ("parent", "child"):
+            element = joint.find(end)
+            link = None if element is None else element.get("link")
+            if link not in links:
+                raise UserError(f"{path}: joint '{name}': its {end} link '{link}' does not exist")
+    return tree
+
+
+def load(path: Path) -> yourdfpy.URDF:
+    """Parse a checked URDF without its meshes."""
+    logging.getLogger("yourdfpy").setLevel(logging.ERROR)
+    try:
+        return yourdfpy.URDF.load(str(path), build_scene_graph=False, load_meshes=False)
+    except (KeyError, ValueError, TypeError) as error:
+        raise UserError(f"{path}: not a valid URDF: {error!r}") from None
+
+
+def _named(path: Path, element: etree._Element) -> str:
+    name = element.get("name")
+    if not name:
+        raise UserError(f"{path}: line {element.sourceline}: a <{element.tag}> has no name")
+    return name
+
+
+def _check_numbers(path: Path, element: etree._Element) -> None:
+    where = f"{path}: {element.tag} '{_named(path, element)}'"
+    for tag, attributes in _NUMERIC.items():
+        for child in element.iter(tag):
+            for attribute in attributes:
+                for text in child.get(attribute, "0").split():
+                    try:
+                        finite = math.isfinite(float(text))
+                    except ValueError:
+                        finite = False
+                    if not finite:
+                        raise UserError(f"{where}: <{tag} {attribute}> is '{text}', which is not a finite number")
+
+
+def _check_inertial(path: Path, link: etree._Element) -> None:
+    where = f"{path}: link '{link.get('name')}'"
+    inertial = link.find("inertial")
+    if inertial is None:
+        return
+    mass, inertia = inertial.find("mass"), inertial.find("inertia")
+    if mass is None or inertia is None:
+        raise UserError(f"{where}: <inertial> needs both <mass> and <inertia>")
+    if float(mass.get("value", "nan")) < 0:
+        raise UserError(f"{where}: its mass is negative ({mass.get('value')})")
+    xx, xy, xz, yy, yz, zz = (float(inertia.get(key, 0)) for key in _NUMERIC["inertia"])
+    moments = np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+    if moments[0] < 0:
+        raise UserError(f"{where}: its inertia is impossible: a principal moment is negative ({moments[0]:g})")

@@ -1,0 +1,102 @@
+"""Reach: bring the end effector to a point of the base frame's x-y plane."""
+
+import math
+from typing import Annotated
+
+import torch
+from pydantic import Field
+from torch import Tensor, nn
+
+from physai.config import Count, NonNegativeFloat, PositiveFloat
+from physai.errors import UserError
+from physai.robots import ForwardKinematics, RobotSpec
+
+
+class ReachObservation(nn.Module):
+    """From what a robot senses to what its policy sees: ``[q, qd, ee_x, ee_y, goal_x, goal_y]``; scriptable.
+
+    Args:
+        kinematics: The robot's forward kinematics.
+    """
+
+    def __init__(self, kinematics: ForwardKinematics) -> None:
+        super().__init__()
+        self.kinematics = kinematics
+
+    def forward(self, joint_position: Tensor, joint_velocity: Tensor, goal: Tensor) -> Tensor:
+        """Map positions [..., n] rad, velocities [..., n] rad/s and goals [..., 2] m to observations [..., 2n + 4]."""
+        end_effector = self.kinematics(joint_position)[..., :2]
+        return torch.cat([joint_position, joint_velocity, end_effector, goal], dim=-1)
+
+
+class Reach:
+    """Goals on a ring around the base; reward is minus the distance, plus a bonus at the goal, which ends the episode.
+
+    Args:
+        goal_radius: Inner and outer radius of the ring, m.
+        tolerance: Distance that counts as reached, m.
+        success_reward: Bonus at the goal.
+        max_steps: Control steps until an episode is truncated.
+        start_spread: Episodes start uniformly within the home pose plus or minus this, rad, one value a joint.
+    """
+
+    goal_size = 2
+
+    def __init__(
+        self,
+        goal_radius: Annotated[list[PositiveFloat], Field(min_length=2, max_length=2)],
+        tolerance: PositiveFloat,
+        success_reward: NonNegativeFloat,
+        max_steps: Count,
+        start_spread: list[NonNegativeFloat],
+    ) -> None:
+        self.goal_radius = goal_radius
+        self.tolerance = tolerance
+        self.success_reward = success_reward
+        self.max_steps = max_steps
+        self.start_spread = start_spread
+
+    def check(self, spec: RobotSpec, kinematics: ForwardKinematics) -> None:
+        """Raise a UserError if this robot cannot do the task."""
+        inner, outer = self.goal_radius
+        if inner >= outer:
+            raise UserError(f"env.task.goal_radius: the inner radius {inner} must be below the outer radius {outer}")
+        if outer > kinematics.reach:
+            raise UserError(f"env.task.goal_radius: {outer} m is beyond the reach of '{spec.name}', {kinematics.reach:.3f} m")
+        if len(self.start_spread) != len(spec.joints):
+            raise UserError(f"env.task.start_spread has {len(self.start_spread)} values for {len(spec.joints)} joints")
+
+    def sample_goal(self, rows: int, generator: torch.Generator) -> Tensor:
+        """Draw goals [rows, 2], m: angle uniform in [0, 2π), radius uniform between the ring's radii."""
+        draw = torch.rand(rows, 2, generator=generator)
+        angle = 2 * math.pi * draw[:, :1]
+        inner, outer = self.goal_radius
+        radius = inner + (outer - inner) * draw[:, 1:]
+        return radius * torch.cat([torch.cos(angle), torch.sin(angle)], dim=-1)
+
+    def sample_start(self, rows: int, spec: RobotSpec, generator: torch.Generator) -> Tensor:
+        """Draw joint positions [rows, n], rad, around the home pose and within the limits."""
+        draw = 2 * torch.rand(rows, len(spec.joints), generator=generator, dtype=torch.float64) - 1
+        start = torch.from_numpy(spec.home) + draw * torch.tensor(self.start_spread, dtype=torch.float64)
+        lower, upper = torch.from_numpy(spec.position_limit).T
+        return torch.clamp(start, lower, upper)
+
+    def observation(self, kinematics: ForwardKinematics) -> ReachObservation:
+        """Return the module that makes observations for a robot."""
+        return ReachObservation(kinematics)
+
+    def observation_size(self, joints: int) -> int:
+        """Length of an observation of a robot with so many joints."""
+        return 2 * joints + 2 + self.goal_size
+
+    def distance(self, end_effector: Tensor, goal: Tensor) -> Tensor:
+        """Distance in the plane, m: [N, 3] and [N, 2] to [N, 1]."""
+        return torch.linalg.vector_norm(end_effector[:, :2] - goal, dim=-1, keepdim=True)
+
+    def success(self, distance: Tensor) -> Tensor:
+        """Whether the goal is reached, [N, 1] to [N, 1]."""
+        return distance < self.tolerance
+
+    def reward(self, distance: Tensor, success: Tensor) -> Tensor:
+        """Reward of the step that led here, [N, 1]."""
+        return self.success_reward * success - distance

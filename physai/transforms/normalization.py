@@ -1,0 +1,70 @@
+"""Running observation normalization, with one set of statistics for all robots."""
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.data import Composite
+from torchrl.envs.transforms import Transform
+
+
+class ObservationNormalization(Transform):
+    """Writes ``normalized_observation = clamp((observation - loc) / scale)``.
+
+    The statistics are fixed while a batch is collected; the learner calls ``update`` once per collected batch. They are exact
+    (Chan, Golub and LeVeque, "Algorithms for computing the sample variance", 1983), in float64, and part of ``state_dict``.
+    (TorchRL's VecNormV2 counts untouched rows again at partial resets, keeps statistics per robot, and does not freeze in
+    evaluation.)
+
+    Args:
+        size: Length of an observation.
+        eps: Lower bound of the scale, in the observation's units.
+        clip: Bound of the result, in standard deviations.
+    """
+
+    def __init__(self, size: int, eps: float, clip: float) -> None:
+        super().__init__(in_keys=["observation"], out_keys=["normalized_observation"])
+        self.eps = eps
+        self.clip = clip
+        self.count: Tensor
+        self.mean: Tensor
+        self.variance: Tensor
+        self.loc: Tensor
+        self.scale: Tensor
+        self.register_buffer("count", torch.zeros((), dtype=torch.float64))
+        self.register_buffer("mean", torch.zeros(size, dtype=torch.float64))
+        self.register_buffer("variance", torch.ones(size, dtype=torch.float64))
+        self.register_buffer("loc", torch.zeros(size))
+        self.register_buffer("scale", torch.ones(size))
+
+    @torch.no_grad()
+    def update(self, observation: Tensor) -> None:
+        """Take a batch of observations [..., size] into the statistics."""
+        batch = observation.reshape(-1, observation.shape[-1]).double()
+        count = self.count + len(batch)
+        variance, mean = torch.var_mean(batch, dim=0, unbiased=False)
+        if self.count == 0:
+            self.mean, self.variance = mean, variance
+        else:
+            delta, share = mean - self.mean, len(batch) / count
+            self.mean = self.mean + delta * share
+            self.variance = (
+                self.variance * (1 - share) + variance * share + delta.square() * share * (1 - share)
+            )
+        self.count = count
+        self.loc = self.mean.float()
+        self.scale = self.variance.sqrt().float().clamp(min=self.eps)
+
+    def normalize(self, observation: Tensor) -> Tensor:
+        """Normalize observations [..., size] with the statistics as they are."""
+        return ((observation - self.loc) / self.scale).clamp(-self.clip, self.clip)
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        return next_tensordict.set("normalized_observation", self.normalize(next_tensordict.get("observation")))
+
+    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+        return self._step(tensordict, tensordict_reset)
+
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
+        """Add the key that the transform writes."""
+        observation_spec["normalized_observation"] = observation_spec["observation"].clone()
+        return observation_spec
