@@ -84,9 +84,9 @@ def make_env(
         transforms.append(ActuatorDelay(layout, num_envs, joints, randomization.max_delay))
     if randomization.affects("encoder_offset", "position_noise", "velocity_noise"):
         transforms.append(SensorModel(layout, 0))
-    size = task.observation_size(joints)
-    transforms.append(Observation(task.observation(base.simulation.kinematics), size))
-    transforms.append(ObservationNormalization(size, normalization.eps, normalization.clip))
+    transforms.append(Observation(task.observation(base.simulation.kinematics)))
     made = TransformedRobotEnv(base, Compose(*transforms))
+    size = made.observation_spec["observation"].shape[-1]
+    made.append_transform(ObservationNormalization(size, normalization.eps, normalization.clip))
     made.set_seed(seed)
     return made

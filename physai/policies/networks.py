@@ -67,21 +67,19 @@ class GaussianActor(TensorDictModuleBase):
         in_features: int,
         action_size: int,
         in_keys: list[str],
-        angle_keys: list[str],
         hidden_sizes: list[Count],
         activation: str,
         initial_std: PositiveFloat,
     ) -> None:
         super().__init__()
-        self.in_keys = [*in_keys, *angle_keys]
-        self._plain = len(in_keys)
+        self.in_keys = in_keys
         self.network = mlp(in_features, hidden_sizes, action_size, activation)
         nn.init.orthogonal_(self.network[-1].weight, 0.01)  # start near zero velocity
         self.log_std = nn.Parameter(torch.full((action_size,), initial_std).log())
 
     def mean(self, tensordict: TensorDictBase) -> Tensor:
         """Mean of the latent action, [.., n]."""
-        return self.network(_inputs(tensordict, self.in_keys, self._plain))
+        return self.network(_inputs(tensordict, self.in_keys))
 
     def get_dist(self, tensordict: TensorDictBase) -> Distribution:
         """Return the distribution of the latent action."""
@@ -118,23 +116,18 @@ class Critic(TensorDictModuleBase):
         self,
         in_features: int,
         in_keys: list[str],
-        angle_keys: list[str],
         hidden_sizes: list[Count],
         activation: str,
     ) -> None:
         super().__init__()
-        self.in_keys = [*in_keys, *angle_keys]
-        self._plain = len(in_keys)
+        self.in_keys = in_keys
         self.network = mlp(in_features, hidden_sizes, 1, activation)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Judge."""
-        return tensordict.set("state_value", self.network(_inputs(tensordict, self.in_keys, self._plain)))
+        return tensordict.set("state_value", self.network(_inputs(tensordict, self.in_keys)))
 
 
-def _inputs(tensordict: TensorDictBase, in_keys: Sequence[str], plain: int) -> Tensor:
-    values = []
-    for index, key in enumerate(in_keys):
-        value = tensordict.get(key)
-        values += [value] if index < plain else [torch.sin(value), torch.cos(value)]
+def _inputs(tensordict: TensorDictBase, in_keys: Sequence[str]) -> Tensor:
+    values = [tensordict.get(key) for key in in_keys]
     return values[0] if len(values) == 1 else torch.cat(values, dim=-1)

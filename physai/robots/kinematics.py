@@ -47,14 +47,19 @@ class ForwardKinematics(nn.Module):
 
     def forward(self, joint_position: Tensor) -> Tensor:
         """Map joint positions [..., n] in rad to end-effector positions [..., 3] in m."""
-        cosine, sine = torch.cos(joint_position), torch.sin(joint_position)
-        point = self.tip.expand(joint_position.shape[:-1] + (3,))
+        return self.linearize(joint_position)[..., 0, :]
+
+    @torch.jit.export
+    def linearize(self, joint_position: Tensor) -> Tensor:
+        """Map joint positions [..., n] in rad to [..., 1 + n, 3]: the end effector in m, then dp/dq of each joint in m/rad."""
+        cosine, sine = torch.cos(joint_position)[..., None], torch.sin(joint_position)[..., None]
+        vectors = self.tip.expand(joint_position.shape[:-1] + (1, 3))
         for joint in range(self.rotations.shape[0] - 1, -1, -1):
-            turned = torch.matmul(point, self.rotations[joint])
-            point = (
-                turned[..., 0:3] * cosine[..., joint : joint + 1]
-                + turned[..., 3:6] * sine[..., joint : joint + 1]
-                + turned[..., 6:9]
-                + self.offsets[joint]
-            )
-        return point
+            turned = torch.matmul(vectors, self.rotations[joint])
+            across, cross = turned[..., 0:3], turned[..., 3:6]
+            c, s = cosine[..., joint : joint + 1, :], sine[..., joint : joint + 1, :]
+            slope = cross[..., 0:1, :] * c - across[..., 0:1, :] * s
+            turned = across * c + cross * s + turned[..., 6:9]
+            # Only the point moves with the offset; slopes are directions.
+            vectors = torch.cat([turned[..., 0:1, :] + self.offsets[joint], slope, turned[..., 1:, :]], dim=-2)
+        return vectors

@@ -13,20 +13,46 @@ from physai.robots import ForwardKinematics, RobotSpec
 
 
 class ReachObservation(nn.Module):
-    """From what a robot senses to what its policy sees: ``[q, qd, ee_x, ee_y, goal_x, goal_y]``; scriptable.
+    """From what a robot senses to what its policy sees; scriptable, and part of the exported policy.
+
+    The observation is ``[q, qd, ee_x, ee_y, goal_x, goal_y]``. Features say the same in terms that a small network learns from
+    quickly: sine and cosine of the joints, the error e = goal - ee, and Jᵀe, the direction in joint space that shortens it
+    fastest (Khatib, 1987); errors appear once in units of the arm and once, saturated, in units of the tolerance.
 
     Args:
         kinematics: The robot's forward kinematics.
+        tolerance: Distance that counts as reached, m.
     """
 
-    def __init__(self, kinematics: ForwardKinematics) -> None:
+    def __init__(self, kinematics: ForwardKinematics, tolerance: float) -> None:
         super().__init__()
         self.kinematics = kinematics
+        self.length = kinematics.reach
+        self.tolerance = tolerance
 
-    def forward(self, joint_position: Tensor, joint_velocity: Tensor, goal: Tensor) -> Tensor:
-        """Map positions [..., n] rad, velocities [..., n] rad/s and goals [..., 2] m to observations [..., 2n + 4]."""
-        end_effector = self.kinematics(joint_position)[..., :2]
-        return torch.cat([joint_position, joint_velocity, end_effector, goal], dim=-1)
+    def forward(self, joint_position: Tensor, joint_velocity: Tensor, goal: Tensor) -> tuple[Tensor, Tensor]:
+        """Map positions [..., n] rad, velocities [..., n] rad/s and goals [..., 2] m to observation and features.
+
+        Returns:
+            Observation [..., 2n + 4] and features [..., 4n + 4].
+        """
+        position_and_slopes = self.kinematics.linearize(joint_position)[..., :2]
+        end_effector, jacobian = position_and_slopes[..., 0, :], position_and_slopes[..., 1:, :]
+        error = goal - end_effector
+        descent = (jacobian * error[..., None, :]).sum(-1) / (self.length * self.tolerance)
+        observation = torch.cat([joint_position, joint_velocity, end_effector, goal], dim=-1)
+        features = torch.cat(
+            [
+                torch.sin(joint_position),
+                torch.cos(joint_position),
+                2.0 * error / self.length,
+                torch.tanh(0.5 * error / self.tolerance),
+                0.25 * descent,
+                torch.tanh(descent),
+            ],
+            dim=-1,
+        )
+        return observation, features
 
 
 class Reach:
@@ -82,12 +108,8 @@ class Reach:
         return torch.clamp(start, lower, upper)
 
     def observation(self, kinematics: ForwardKinematics) -> ReachObservation:
-        """Return the module that makes observations for a robot."""
-        return ReachObservation(kinematics)
-
-    def observation_size(self, joints: int) -> int:
-        """Length of an observation of a robot with so many joints."""
-        return 2 * joints + 2 + self.goal_size
+        """Return the module that makes observation and features for a robot."""
+        return ReachObservation(kinematics, self.tolerance)
 
     def distance(self, end_effector: Tensor, goal: Tensor) -> Tensor:
         """Distance in the plane, m: [N, 3] and [N, 2] to [N, 1]."""

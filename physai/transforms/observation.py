@@ -8,27 +8,28 @@ from torchrl.envs.transforms import Transform
 
 
 class Observation(Transform):
-    """Writes ``observation`` [N, observation_size] from ``joint_position``, ``joint_velocity`` and ``goal``.
+    """Writes ``observation`` and ``features`` from ``joint_position``, ``joint_velocity`` and ``goal``.
 
     Args:
         module: The task's observation module, the same that the exported policy carries.
-        size: Length of an observation.
     """
 
-    def __init__(self, module: nn.Module, size: int) -> None:
-        super().__init__(in_keys=["joint_position", "joint_velocity", "goal"], out_keys=["observation"])
+    def __init__(self, module: nn.Module) -> None:
+        super().__init__(in_keys=["joint_position", "joint_velocity", "goal"], out_keys=["observation", "features"])
         self.module = module
-        self.size = size
 
     @torch.no_grad()
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        inputs = [next_tensordict.get(key) for key in self.in_keys]
-        return next_tensordict.set("observation", self.module(*inputs))
+        observation, features = self.module(*(next_tensordict.get(key) for key in self.in_keys))
+        return next_tensordict.set("observation", observation).set("features", features)
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         return self._step(tensordict, tensordict_reset)
 
+    @torch.no_grad()
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        """Add the key that the transform writes."""
-        observation_spec["observation"] = Unbounded(shape=(*observation_spec.shape, self.size))
+        """Add the keys that the transform writes."""
+        values = self.module(*(observation_spec[key].zero() for key in self.in_keys))
+        for key, value in zip(self.out_keys, values, strict=True):
+            observation_spec[key] = Unbounded(shape=value.shape)
         return observation_spec
