@@ -67,4 +67,5 @@ def make_collector(
         frames_per_batch=config.frames_per_batch,
         total_frames=-(-total_frames // config.frames_per_batch) * config.frames_per_batch,
         track_traj_ids=False,
+        auto_register_policy_transforms=False,
     )

@@ -1,0 +1,94 @@
+"""Training curves."""
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+import matplotlib
+import numpy as np
+import pandas as pd
+from omegaconf import OmegaConf
+
+from physai.errors import UserError
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt  # noqa: E402
+
+_BINS = 60
+
+
+def plot_runs(runs: Sequence[Path], output: Path) -> None:
+    """Draw episode return (left) and length (right) over frames, smoothed, with their spread.
+
+    One run shows the mean of its episodes and the band of their 10th to 90th percentile. Runs that differ only in their seed
+    become one curve: the mean over runs, in the band from the lowest to the highest of them.
+
+    Args:
+        runs: Run folders.
+        output: The PNG to write.
+
+    Raises:
+        UserError: If a run has no episodes to draw.
+    """
+    groups: dict[str, list[pd.DataFrame]] = {}
+    for run in runs:
+        groups.setdefault(_label(run), []).append(_episodes(run))
+    figure, axes = plt.subplots(1, 2, figsize=(11, 4.2), layout="constrained")
+    for axis, column, title in zip(axes, ("return", "length"), ("Episode return", "Episode length (steps)"), strict=True):
+        for label, members in groups.items():
+            _curve(axis, members, column, label)
+        axis.set_title(title)
+        axis.set_xlabel("frames")
+        axis.grid(alpha=0.25)
+        axis.xaxis.set_major_formatter(matplotlib.ticker.EngFormatter(sep=""))
+        axis.spines[["top", "right"]].set_visible(False)
+    handles, labels = axes[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=min(3, len(labels)), frameon=False)
+    figure.savefig(output, dpi=130)
+    plt.close(figure)
+
+
+def _episodes(run: Path) -> pd.DataFrame:
+    path = run / "episodes.csv"
+    if not path.is_file():
+        raise UserError(f"{run}: no run there (it has no episodes.csv)")
+    episodes = pd.read_csv(path)
+    if episodes.empty:
+        raise UserError(f"{run}: no episode has ended yet, there is nothing to draw")
+    return episodes
+
+
+def _label(run: Path) -> str:
+    """What a run is, but for its seed: runs with equal labels are repetitions."""
+    try:
+        overrides = OmegaConf.to_container(OmegaConf.load(run / ".hydra" / "overrides.yaml"))
+        config = OmegaConf.load(run / ".hydra" / "config.yaml")
+    except OSError:
+        return run.name
+    rest = [item for item in overrides if not item.startswith(("seed=", "env=", "hydra."))]
+    return ", ".join([config.env.name, *rest])
+
+
+def _curve(axis: plt.Axes, members: list[pd.DataFrame], column: str, label: str) -> None:
+    edges = np.linspace(0, max(episodes["frame"].max() for episodes in members), _BINS + 1)
+    centers = (edges[1:] + edges[:-1]) / 2
+    binned = [episodes.groupby(pd.cut(episodes["frame"], edges), observed=False)[column] for episodes in members]
+    means = pd.DataFrame([_smooth(groups.mean()).to_numpy() for groups in binned])
+    if len(members) == 1:
+        low, high = (_smooth(binned[0].quantile(q)).to_numpy() for q in (0.1, 0.9))
+        name = f"{label}: mean, 10th to 90th percentile"
+    else:
+        low, high = means.min().to_numpy(), means.max().to_numpy()
+        name = f"{label}: mean and range of {len(members)} runs"
+    (line,) = axis.plot(centers, means.mean().to_numpy(), linewidth=2, label=name)
+    axis.fill_between(centers, low, high, alpha=0.2, color=line.get_color(), linewidth=0)
+
+
+def _smooth(values: pd.Series) -> pd.Series:
+    return values.interpolate(limit_direction="both").rolling(3, center=True, min_periods=1).mean()
+
+
+def read_summary(run: Path) -> dict | None:
+    """Return the summary of a finished run."""
+    path = run / "summary.json"
+    return json.loads(path.read_text()) if path.is_file() else None

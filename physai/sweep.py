@@ -1,0 +1,55 @@
+"""The end of a sweep: one table of all its runs, one plot, and no failure unseen."""
+
+import sys
+from pathlib import Path
+from typing import Any
+
+from hydra.experimental.callback import Callback
+from omegaconf import DictConfig, OmegaConf
+from rich.console import Console
+from rich.table import Table
+
+
+class SweepReport(Callback):
+    """Hydra callback; exits with code 1 if a run of the sweep failed."""
+
+    def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:
+        """Report on the runs below the sweep's folder."""
+        from physai.plotting import plot_runs, read_summary
+
+        folder = Path(config.hydra.sweep.dir)
+        runs = sorted((path.parent.parent for path in folder.glob("*/.hydra/overrides.yaml")), key=_number)
+        summaries = {run: read_summary(run) for run in runs}
+        table = Table(title=f"{folder}", title_justify="left")
+        for column in ("run", "overrides", "success", "steps", "frames", "seconds"):
+            table.add_column(column, justify="left" if column in ("run", "overrides") else "right")
+        for run, summary in summaries.items():
+            overrides = " ".join(OmegaConf.to_container(OmegaConf.load(run / ".hydra" / "overrides.yaml")))
+            table.add_row(run.name, overrides, *_figures(run, summary))
+        Console().print(table)
+        finished = [run for run, summary in summaries.items() if summary]
+        if finished:
+            plot_runs(finished, folder / "training.png")
+            print(f"Curves of all runs: {folder / 'training.png'}")
+        failed = [run for run in runs if run not in finished]
+        if failed:
+            print(f"error: {len(failed)} of {len(runs)} runs failed: {', '.join(map(str, failed))}", file=sys.stderr)
+            sys.exit(1)
+
+
+def _number(run: Path) -> tuple[int, str]:
+    return (int(run.name) if run.name.isdigit() else 0, run.name)
+
+
+def _figures(run: Path, summary: dict[str, Any] | None) -> list[str]:
+    if summary is None:
+        error = run / "error.txt"
+        reason = error.read_text().splitlines()[0] if error.is_file() else "no summary.json"
+        return [f"[red]failed: {reason}[/red]", "", "", ""]
+    steps = summary["steps_to_goal"]
+    return [
+        f"{summary['success_rate']:.1%}",
+        "-" if steps is None else f"{steps:.0f}",
+        f"{summary['frames']:,}",
+        f"{summary['train_seconds']:.1f}",
+    ]

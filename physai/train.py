@@ -1,0 +1,88 @@
+"""``python -m physai.train``: train a policy (see ``--help``)."""
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from omegaconf import DictConfig, open_dict
+
+from physai import cli
+from physai.errors import UserError
+
+if TYPE_CHECKING:
+    from physai.training.config import TrainConfig
+
+
+def main() -> None:
+    """Start a run, a sweep, or an interrupted run again."""
+    given = cli.overrides()
+    resumed = [override.partition("=")[2] for override in given if override.startswith("resume=")]
+    if resumed and resumed[-1] not in ("", "null"):
+        others = [override for override in given if not override.startswith("resume=")]
+        with cli.guard():
+            _resume(Path(resumed[-1].strip("'\"")), others)
+    else:
+        cli.main("train", _train, _check)
+
+
+def _config(node: DictConfig) -> "TrainConfig":
+    from physai.config import validate
+    from physai.training.config import TrainConfig
+
+    with open_dict(node):
+        node.pop("resume", None)
+    return validate(TrainConfig, node)
+
+
+def _check(node: DictConfig) -> None:
+    """Build every part of a run in small, so that whatever is wrong shows before a run folder exists."""
+    from physai.training.agent import Agent, make_logger  # noqa: F401
+
+    config = _config(node)
+    Agent.build(config).close()
+
+
+def _train(node: DictConfig, run_dir: Path) -> None:
+    _run(_config(node), run_dir, resume=False)
+
+
+def _resume(run_dir: Path, given: list[str]) -> None:
+    from physai.config import compose
+    from physai.training.run import load_config
+
+    if any(argument in ("-m", "--multirun") for argument in sys.argv):
+        raise UserError("resume continues one run; it cannot be swept over")
+    config = load_config(run_dir)
+    if given:
+        saved = (run_dir / ".hydra" / "overrides.yaml").read_text()
+        overrides = [line.removeprefix("- ").strip("'\"") for line in saved.splitlines() if line.startswith("- ")]
+        wanted = _config(compose("train", [*overrides, *given]))
+        difference = _first_difference(config.model_dump(), wanted.model_dump())
+        if difference:
+            raise UserError(f"resume={run_dir}: the run has {difference}; a resumed run keeps its config")
+    _run(config, run_dir, resume=True)
+
+
+def _first_difference(run: Any, wanted: Any, key: str = "") -> str | None:
+    if isinstance(run, dict) and isinstance(wanted, dict):
+        for name in {**run, **wanted}:
+            found = _first_difference(run.get(name), wanted.get(name), f"{key}.{name}" if key else name)
+            if found:
+                return found
+        return None
+    return None if run == wanted else f"{key}={run}, not {wanted}"
+
+
+def _run(config: "TrainConfig", run_dir: Path, resume: bool) -> None:
+    from physai.training.loop import Interrupted
+    from physai.training.run import run_training
+
+    try:
+        run_training(config, run_dir, resume)
+    except Interrupted as stopped:
+        print(f"\nStopped by {stopped}; everything is saved. Go on with:\n  python -m physai.train resume={run_dir}")
+        sys.exit(stopped.exit_code)
+
+
+if __name__ == "__main__":
+    main()

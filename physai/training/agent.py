@@ -1,0 +1,114 @@
+"""The parts of a run, built from its config; and the trained part of them, read back from a file."""
+
+import hashlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from hydra.errors import InstantiationException
+from hydra.utils import instantiate
+from tensordict.nn import TensorDictModuleBase
+
+from physai.algorithms import OnPolicy
+from physai.collectors import RobotCollector, make_collector
+from physai.envs.make import TransformedRobotEnv, make_env
+from physai.errors import UserError
+from physai.policies import input_size
+from physai.seeding import derive
+from physai.training.config import TrainConfig
+from physai.transforms import RandomizationConfig
+
+
+@dataclass
+class Agent:
+    """What learns, and where: env, collector, networks, algorithm."""
+
+    env: TransformedRobotEnv
+    actor: TensorDictModuleBase
+    critic: TensorDictModuleBase
+    algorithm: OnPolicy
+    collector: RobotCollector
+
+    @classmethod
+    def build(cls, config: TrainConfig) -> "Agent":
+        """Build all parts; seeds the process' random numbers, which weights, exploration and minibatches use.
+
+        Raises:
+            UserError: If a part cannot be built from its config.
+        """
+        torch.set_num_threads(config.threads)
+        torch.manual_seed(derive(config.seed, "learner"))
+        env = make_env(
+            config.env,
+            config.randomization,
+            config.normalization,
+            config.collector.num_envs,
+            derive(config.seed, "train"),
+        )
+        actor = make_actor(config, env)
+        inputs = input_size(env.observation_spec, config.policy.critic["in_keys"], "policy.critic")
+        critic = _make("policy.critic", config.policy.critic, in_features=inputs)
+        algorithm = _make(
+            "algo", config.algo, actor=actor, critic=critic, frames_per_batch=config.collector.frames_per_batch
+        )
+        collector = make_collector(config.collector, env, actor, config.total_frames)
+        return cls(env, actor, critic, algorithm, collector)
+
+    def weights_sha256(self) -> str:
+        """Hash of the networks' weights and the normalization statistics."""
+        digest = hashlib.sha256()
+        for module in (self.actor, self.critic, self.env.normalization):
+            for name, value in sorted(module.state_dict().items()):
+                digest.update(name.encode())
+                digest.update(value.contiguous().numpy().tobytes())
+        return digest.hexdigest()
+
+    def policy_state(self) -> dict[str, Any]:
+        """What acting needs: the actor's weights and the normalization statistics."""
+        return {
+            "actor": {key: value.clone() for key, value in self.actor.state_dict().items()},
+            "normalization": {key: value.clone() for key, value in self.env.normalization.state_dict().items()},
+        }
+
+    def close(self) -> None:
+        """Free the robots."""
+        self.collector.shutdown()
+
+
+def make_actor(config: TrainConfig, env: TransformedRobotEnv) -> TensorDictModuleBase:
+    """Build an untrained actor for an env."""
+    inputs = input_size(env.observation_spec, config.policy.actor["in_keys"], "policy.actor")
+    return _make(
+        "policy.actor", config.policy.actor, in_features=inputs, action_size=env.action_spec.shape[-1]
+    )
+
+
+def load_policy_state(actor: TensorDictModuleBase, env: TransformedRobotEnv, state: dict[str, Any]) -> None:
+    """Give an actor its weights and an env its normalization statistics."""
+    actor.load_state_dict(state["actor"])
+    env.normalization.load_state_dict(state["normalization"])
+
+
+def make_evaluation_env(
+    config: TrainConfig, randomization: RandomizationConfig, num_envs: int, seed: int
+) -> TransformedRobotEnv:
+    """Build an env of its own for evaluation, with random numbers that training never uses."""
+    return make_env(config.env, randomization, config.normalization, num_envs, derive(seed, "evaluation"))
+
+
+def make_logger(config: TrainConfig, run_dir: Path) -> Any:
+    """Build the TorchRL logger."""
+    return _make("logger", config.logger, log_dir=str(run_dir))
+
+
+def _make(where: str, node: dict[str, Any], **parts: Any) -> Any:
+    try:
+        return instantiate(node, **parts, _convert_="all")
+    except InstantiationException as error:
+        cause = error.__cause__ or error
+        if isinstance(cause, UserError):
+            raise cause from None
+        raise UserError(f"{where}: {' '.join(str(cause).split())}") from None
+    except (TypeError, ValueError, AttributeError, ImportError) as error:
+        raise UserError(f"{where}: {' '.join(str(error).split())}") from None

@@ -1,0 +1,107 @@
+"""Checkpoints that survive a kill: written to a temporary name, synced, renamed; read without running code."""
+
+import io
+import os
+import pickle
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from physai.errors import UserError
+
+_FORMAT = 1
+
+
+def write(path: Path, content: bytes) -> None:
+    """Write a file; whatever happens, ``path`` holds either the old content or the new.
+
+    Raises:
+        OSError: If the disk refuses.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}.tmp")
+    try:
+        with open(temporary, "wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+    folder = os.open(path.parent, os.O_RDONLY)
+    try:
+        os.fsync(folder)
+    finally:
+        os.close(folder)
+
+
+def save(path: Path, content: dict[str, Any]) -> None:
+    """Write tensors and plain values, as safely as ``write``."""
+    buffer = io.BytesIO()
+    torch.save({"format": _FORMAT, **content}, buffer)
+    write(path, buffer.getvalue())
+
+
+def load(path: Path) -> dict[str, Any]:
+    """Read a checkpoint; code in the file is not run.
+
+    Raises:
+        UserError: If the file is missing, damaged, or of another format.
+    """
+    try:
+        content = torch.load(path, weights_only=True)
+    except FileNotFoundError:
+        raise UserError(f"{path}: no such checkpoint") from None
+    except (RuntimeError, EOFError, pickle.UnpicklingError, ValueError, KeyError, OSError) as error:
+        raise UserError(f"{path}: the checkpoint is damaged ({str(error).splitlines()[0][:80]})") from None
+    if not isinstance(content, dict) or content.get("format") != _FORMAT:
+        raise UserError(f"{path}: not a checkpoint of this version of physai")
+    return content
+
+
+class CheckpointFolder:
+    """The last few checkpoints of a run, by frames, and the best policy.
+
+    Args:
+        folder: Where they lie.
+        keep: How many to keep, apart from the best policy.
+    """
+
+    def __init__(self, folder: Path, keep: int) -> None:
+        self.folder = folder
+        self.keep = keep
+
+    @property
+    def best(self) -> Path:
+        """The best policy so far."""
+        return self.folder / "best.pt"
+
+    def paths(self) -> list[Path]:
+        """All checkpoints, oldest first."""
+        return sorted(path for path in self.folder.glob("*.pt") if path.stem.isdigit())
+
+    def find(self, which: str) -> Path:
+        """Return the file of ``best``, ``last``, or a number of frames.
+
+        Raises:
+            UserError: If there is none.
+        """
+        paths = self.paths()
+        if which == "best" and self.best.is_file():
+            return self.best
+        if which == "last" and paths:
+            return paths[-1]
+        for path in paths:
+            if which.isdigit() and int(path.stem) == int(which):
+                return path
+        have = ", ".join([*(["best"] if self.best.is_file() else []), *(str(int(path.stem)) for path in paths)])
+        raise UserError(f"{self.folder}: no checkpoint '{which}'; there are: {have or 'none'}")
+
+    def save(self, frames: int, content: dict[str, Any]) -> Path:
+        """Save the checkpoint of so many frames, then drop the oldest beyond ``keep``."""
+        path = self.folder / f"{frames:012d}.pt"
+        save(path, content)
+        for old in self.paths()[: -self.keep]:
+            old.unlink()
+        return path

@@ -1,0 +1,52 @@
+"""Types and ranges of ``conf/train.yaml``; the values are there."""
+
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from physai.collectors import CollectorConfig
+from physai.config import Config, Count, Target
+from physai.envs.make import NormalizationConfig
+from physai.envs.simulation import EnvConfig
+from physai.transforms import RandomizationConfig
+
+
+class CheckpointConfig(Config):
+    """When to save, and how many files to keep."""
+
+    every_frames: Count
+    keep: Count
+
+
+class EvaluationConfig(Config):
+    """How the policy is judged while it trains, and at the end."""
+
+    every_frames: Count
+    goals: Count
+    episodes: Count
+    randomization: RandomizationConfig
+
+
+class PolicyConfig(Config):
+    """One file of ``conf/policy``."""
+
+    actor: Target
+    critic: Target
+
+
+class TrainConfig(Config):
+    """Everything that decides the outcome of a run."""
+
+    env: EnvConfig
+    algo: Target
+    policy: PolicyConfig
+    collector: CollectorConfig
+    randomization: RandomizationConfig
+    normalization: NormalizationConfig
+    checkpoint: CheckpointConfig
+    evaluation: EvaluationConfig
+    logger: Target
+    seed: Annotated[int, Field(ge=0, lt=2**32)]
+    total_frames: Count
+    device: Literal["cpu"]
+    threads: Count

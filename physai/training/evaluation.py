@@ -1,0 +1,86 @@
+"""Judging a policy: one deterministic episode per goal, all goals at once."""
+
+from dataclasses import dataclass
+
+import torch
+from scipy.stats import binomtest
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from physai.envs.make import TransformedRobotEnv
+
+MAX_ROBOTS = 1000
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Results of E episodes, each [E].
+
+    Attributes:
+        success: Whether the goal was reached.
+        length: Control steps until it was, or until the episode was cut off.
+        distance: To the goal at the end, m.
+        episode_return: Sum of rewards.
+    """
+
+    success: Tensor
+    length: Tensor
+    distance: Tensor
+    episode_return: Tensor
+
+    @property
+    def success_rate(self) -> float:
+        """Share of goals reached."""
+        return float(self.success.double().mean())
+
+    @property
+    def success_ci(self) -> tuple[float, float]:
+        """95 % confidence interval of the success rate (Wilson, 1927)."""
+        interval = binomtest(int(self.success.sum()), len(self.success)).proportion_ci(method="wilson")
+        return float(interval.low), float(interval.high)
+
+    def summary(self) -> dict[str, float | list[float] | None]:
+        """The figures that scripts rely on; ``steps_to_goal`` averages over reached goals, and is None without any."""
+        reached = self.length[self.success]
+        return {
+            "success_rate": self.success_rate,
+            "success_ci": list(self.success_ci),
+            "steps_to_goal": float(reached.double().mean()) if len(reached) else None,
+            "final_distance": float(self.distance.double().mean()),
+            "return": float(self.episode_return.double().mean()),
+        }
+
+
+def evaluate(policy: TensorDictModuleBase, env: TransformedRobotEnv, episodes: int, seed: int) -> Evaluation:
+    """Let a policy act deterministically for one episode per goal; the goals follow from the seed alone.
+
+    Args:
+        policy: Writes ``action``.
+        env: Its robots each play one episode at a time; its normalization is used as it is.
+        episodes: How many goals.
+        seed: Seeds goals, starts, and whatever the env randomizes.
+    """
+    env.set_seed(seed)
+    rounds = [_one_round(policy, env) for _ in range(-(-episodes // env.simulation.num_envs))]
+    return Evaluation(*(torch.cat(column)[:episodes] for column in zip(*rounds, strict=True)))
+
+
+@torch.no_grad()
+def _one_round(policy: TensorDictModuleBase, env: TransformedRobotEnv) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    tensordict = env.reset()
+    robots = env.simulation.num_envs
+    finished = torch.zeros(robots, dtype=torch.bool)
+    success, length = torch.zeros(robots, dtype=torch.bool), torch.zeros(robots, dtype=torch.int64)
+    distance, episode_return = torch.zeros(robots), torch.zeros(robots)
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        while not finished.all():
+            tensordict = env.step(policy(tensordict)).get("next")
+            # Robots that are done idle on until the last one is; only their first episode counts.
+            now = tensordict.get("done")[:, 0] & ~finished
+            finished |= now
+            success[now] = tensordict.get("terminated")[now, 0]
+            length[now] = tensordict.get("episode_length")[now, 0]
+            distance[now] = env.simulation.distance[now, 0]
+            episode_return[now] = tensordict.get("episode_return")[now, 0]
+    return success, length, distance, episode_return

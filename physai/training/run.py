@@ -1,0 +1,124 @@
+"""A whole run: train, judge the best policy on goals it has never seen, write it all down."""
+
+import json
+import subprocess
+from pathlib import Path
+from typing import Any
+
+from omegaconf import OmegaConf
+from rich.console import Console
+from rich.table import Table
+
+from physai.config import validate
+from physai.errors import UserError
+from physai.plotting import plot_runs
+from physai.seeding import derive
+from physai.training import checkpoint
+from physai.training.agent import Agent, load_policy_state, make_actor, make_evaluation_env
+from physai.training.config import TrainConfig
+from physai.training.evaluation import MAX_ROBOTS, Evaluation, evaluate
+from physai.training.loop import Clock, train
+from physai.transforms import RandomizationConfig
+
+FINAL_SEED = derive(0, "final evaluation goals")
+
+
+def load_config(run_dir: Path) -> TrainConfig:
+    """Read the config of a run.
+
+    Raises:
+        UserError: If there is no run, or its config is damaged.
+    """
+    path = run_dir / ".hydra" / "config.yaml"
+    if not path.is_file():
+        raise UserError(f"{run_dir}: no run there (it has no .hydra/config.yaml)")
+    try:
+        node = OmegaConf.load(path)
+        node.pop("resume", None)
+    except Exception as error:  # whatever YAML makes of a truncated file
+        raise UserError(f"{path}: the run's config is damaged ({' '.join(str(error).split())[:80]})") from None
+    try:
+        return validate(TrainConfig, node)
+    except UserError as error:
+        raise UserError(f"{path}: the run's config is damaged or from another version: {error}") from None
+
+
+def run_training(config: TrainConfig, run_dir: Path, resume: bool = False) -> dict[str, Any]:
+    """Train in ``run_dir`` and write ``summary.json`` and ``training.png``; return the summary."""
+    done = run_dir / "summary.json"
+    if resume and done.is_file():
+        print(f"{run_dir} is complete already.")
+        summary = json.loads(done.read_text())
+        print_summary(summary, f"{run_dir}")
+        return summary
+    agent, clock = train(config, run_dir, resume)
+    try:
+        result = evaluate_run(
+            config, run_dir, "best", config.evaluation.randomization, config.evaluation.episodes, FINAL_SEED
+        )
+        summary = _summary(config, agent, clock, result)
+    finally:
+        agent.close()
+    plot_runs([run_dir], run_dir / "training.png")
+    checkpoint.write(done, json.dumps(summary, indent=2).encode())
+    print_summary(summary, f"{config.env.name}: the best policy, on {len(result.success):,} goals it has never seen")
+    print(f"Run folder: {run_dir}")
+    return summary
+
+
+def evaluate_run(
+    config: TrainConfig, run_dir: Path, which: str, randomization: RandomizationConfig, episodes: int, seed: int
+) -> Evaluation:
+    """Judge a checkpoint (``best``, ``last``, or a number of frames) of a run."""
+    state = checkpoint.load(checkpoint.CheckpointFolder(run_dir / "checkpoints", 1).find(which))
+    env = make_evaluation_env(config, randomization, min(episodes, MAX_ROBOTS), seed)
+    try:
+        actor = make_actor(config, env)
+        load_policy_state(actor, env, state)
+        return evaluate(actor, env, episodes, seed)
+    finally:
+        env.close()
+
+
+def _summary(config: TrainConfig, agent: Agent, clock: Clock, result: Evaluation) -> dict[str, Any]:
+    return {
+        "env": config.env.name,
+        **result.summary(),
+        "randomization": config.evaluation.randomization.name,
+        "frames": clock.frames,
+        "best_frames": clock.best_frames,
+        "train_seconds": round(clock.seconds, 3),
+        "frames_per_second": round(clock.frames / clock.seconds, 1),
+        "weights_sha256": agent.weights_sha256(),
+        "seed": config.seed,
+        "git_commit": _git_commit(),
+    }
+
+
+def _git_commit() -> str | None:
+    command = ["git", "-C", str(Path(__file__).parent), "rev-parse", "HEAD"]
+    try:
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+    except (OSError, subprocess.CalledProcessError):
+        return None
+
+
+def print_summary(summary: dict[str, Any], title: str) -> None:
+    """Show the figures that matter as a table."""
+    low, high = summary["success_ci"]
+    steps = summary["steps_to_goal"]
+    rows = {
+        "success rate": f"{summary['success_rate']:.1%}   (95 % interval {low:.1%} to {high:.1%})",
+        "steps to goal": "none reached" if steps is None else f"{steps:.1f}",
+        "final distance": f"{summary['final_distance'] * 100:.1f} cm",
+        "return": f"{summary['return']:.2f}",
+        "randomization": summary["randomization"],
+    }
+    if "train_seconds" in summary:
+        rows["training"] = (
+            f"{summary['frames']:,} frames in {summary['train_seconds']:.1f} s ({summary['frames_per_second']:,.0f}/s)"
+        )
+    table = Table(title=title, show_header=False, title_justify="left")
+    for row in rows.items():
+        table.add_row(*row)
+    Console().print(table)
