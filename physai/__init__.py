@@ -1,1 +1,41 @@
-"""physai: the shortest trustworthy way from a simulated robot arm to a policy on a ROS 2 robot."""
+"""physai: the shortest trustworthy way from a simulated robot arm to a policy on a ROS 2 robot.
+
+Importing it registers ``physai/Reacher-v0`` and ``physai/KukaReacher-v0`` with Gymnasium, where that is installed, and
+imports nothing heavy.
+"""
+
+import importlib.util
+from typing import TYPE_CHECKING, Any
+
+from physai.errors import UserError
+
+if TYPE_CHECKING:
+    from physai.envs.make import TransformedRobotEnv
+
+__version__ = "0.1.0"
+__all__ = ["UserError", "make_env"]
+
+_GYMNASIUM_IDS = {"physai/Reacher-v0": "reacher", "physai/KukaReacher-v0": "kuka_reacher"}
+
+
+def make_env(*args: Any, **kwargs: Any) -> "TransformedRobotEnv":
+    """Make a batched TorchRL env by name: see :func:`physai.envs.make.make`."""
+    from physai.envs.make import make
+
+    return make(*args, **kwargs)
+
+
+def _register() -> None:
+    from gymnasium import register
+
+    for name, env in _GYMNASIUM_IDS.items():
+        register(
+            name,
+            entry_point="physai.envs.gym_env:RobotGymEnv",
+            vector_entry_point="physai.envs.gym_env:RobotVectorEnv",
+            kwargs={"env": env},
+        )
+
+
+if importlib.util.find_spec("gymnasium") is not None:  # a robot that only runs policies may not have it
+    _register()

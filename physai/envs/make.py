@@ -1,10 +1,12 @@
 """The one place where an environment and its transforms are put together."""
 
+from collections.abc import Sequence
+
 from torch import Tensor
 from torchrl.envs import TransformedEnv
 from torchrl.envs.transforms import Compose, Transform
 
-from physai.config import Config, PositiveFloat
+from physai.config import Config, PositiveFloat, compose, validate
 from physai.envs.robot_env import RobotEnv
 from physai.envs.simulation import EnvConfig, Simulation
 from physai.seeding import derive
@@ -75,7 +77,7 @@ def make_env(
         seed: Seeds every source of randomness in the env.
     """
     base = RobotEnv(env, num_envs)
-    layout, task = base.simulation.layout, base.simulation.task
+    layout = base.simulation.layout
     joints = len(base.simulation.spec.joints)
     transforms: list[Transform] = []
     if randomization.draws:
@@ -84,9 +86,33 @@ def make_env(
         transforms.append(ActuatorDelay(layout, num_envs, joints, randomization.max_delay))
     if randomization.affects("encoder_offset", "position_noise", "velocity_noise"):
         transforms.append(SensorModel(layout, 0))
-    transforms.append(Observation(task.observation(base.simulation.kinematics)))
+    transforms.append(Observation(base.simulation.observation))
     made = TransformedRobotEnv(base, Compose(*transforms))
     size = made.observation_spec["observation"].shape[-1]
     made.append_transform(ObservationNormalization(size, normalization.eps, normalization.clip))
     made.set_seed(seed)
     return made
+
+
+def make(
+    name: str = "reacher", num_envs: int = 64, seed: int = 0, overrides: Sequence[str] = ()
+) -> TransformedRobotEnv:
+    """Compose a config and make its env, for notebooks; also ``physai.make_env``.
+
+    Args:
+        name: A file of ``conf/env``.
+        num_envs: N.
+        seed: Seeds every source of randomness in the env.
+        overrides: Hydra overrides such as ``randomization=strong`` or ``env.max_velocity=1.0``.
+
+    Raises:
+        UserError: If an override is wrong; the message names the nearest right one.
+    """
+    node = compose("train", [f"env={name}", *overrides])
+    return make_env(
+        validate(EnvConfig, node.env),
+        validate(RandomizationConfig, node.randomization),
+        validate(NormalizationConfig, node.normalization),
+        num_envs,
+        seed,
+    )

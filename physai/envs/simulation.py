@@ -10,6 +10,7 @@ from physai.config import Config, Count, PositiveFloat, Target
 from physai.errors import UserError
 from physai.physics import ParameterLayout, Physics
 from physai.physics.pybullet import PyBulletPhysics
+from physai.physics.viewer import Viewer
 from physai.robots import ForwardKinematics, RobotConfig, RobotSpec
 
 
@@ -33,6 +34,7 @@ class Simulation:
         seed: Seeds goals and start poses.
 
     Attributes:
+        observation: The task's module that makes what a policy sees.
         joint_position, joint_velocity: True joint state, rad and rad/s, [N, n].
         goal: [N, 2], m.
         distance: To the goal, m, [N, 1].
@@ -54,6 +56,7 @@ class Simulation:
                 f"env.max_velocity: {config.max_velocity} rad/s is beyond the limit of '{self.spec.name}', "
                 f"{self.spec.velocity_limit.min():g} rad/s"
             )
+        self.observation = self.task.observation(self.kinematics)
         self.physics: Physics = PyBulletPhysics(self.spec, num_envs, config.control_dt, config.substeps)
         self.generator = torch.Generator()
         self.seed(seed)
@@ -129,6 +132,12 @@ class Simulation:
         self.episode_length, self.episode_return = state["episode_length"], state["episode_return"]
         self.generator.set_state(state["generator"])
         self._read(*self.physics.joint_state())
+
+    def viewer(self, window: bool = False) -> Viewer:
+        """Make a viewer for these robots; it has a world of its own."""
+        home = torch.from_numpy(self.spec.home).float()
+        height = float(self.kinematics(home)[2])
+        return Viewer(self.spec, height, self.kinematics.reach, self.task.tolerance, window)
 
     def close(self) -> None:
         """Free the physics engine."""

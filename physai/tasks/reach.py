@@ -111,6 +111,17 @@ class Reach:
         """Return the module that makes observation and features for a robot."""
         return ReachObservation(kinematics, self.tolerance)
 
+    def observation_bounds(self, spec: RobotSpec, kinematics: ForwardKinematics) -> tuple[Tensor, Tensor]:
+        """Lower and upper bound of an observation, [2n + 4] each, with some room, for limits of joints are not walls."""
+        velocity = 2.0 * torch.from_numpy(spec.velocity_limit)
+        lower, upper = torch.from_numpy(spec.position_limit).T
+        end_effector = torch.full((2,), kinematics.reach * 1.01)
+        goal = torch.full((2,), self.goal_radius[1])
+        return (
+            torch.cat([lower - 0.5, -velocity, -end_effector, -goal]).float(),
+            torch.cat([upper + 0.5, velocity, end_effector, goal]).float(),
+        )
+
     def distance(self, end_effector: Tensor, goal: Tensor) -> Tensor:
         """Distance in the plane, m: [N, 3] and [N, 2] to [N, 1]."""
         return torch.linalg.vector_norm(end_effector[:, :2] - goal, dim=-1, keepdim=True)

@@ -8,8 +8,10 @@ from typing import Any
 from omegaconf import OmegaConf
 from rich.console import Console
 from rich.table import Table
+from tensordict.nn import TensorDictModuleBase
 
 from physai.config import validate
+from physai.envs.make import TransformedRobotEnv
 from physai.errors import UserError
 from physai.plotting import plot_runs
 from physai.seeding import derive
@@ -53,9 +55,7 @@ def run_training(config: TrainConfig, run_dir: Path, resume: bool = False) -> di
         return summary
     agent, clock = train(config, run_dir, resume)
     try:
-        result = evaluate_run(
-            config, run_dir, "best", config.evaluation.randomization, config.evaluation.episodes, FINAL_SEED
-        )
+        result = TrainedPolicy(run_dir, "best").evaluate(config.evaluation.episodes)
         summary = _summary(config, agent, clock, result)
     finally:
         agent.close()
@@ -66,18 +66,37 @@ def run_training(config: TrainConfig, run_dir: Path, resume: bool = False) -> di
     return summary
 
 
-def evaluate_run(
-    config: TrainConfig, run_dir: Path, which: str, randomization: RandomizationConfig, episodes: int, seed: int
-) -> Evaluation:
-    """Judge a checkpoint (``best``, ``last``, or a number of frames) of a run."""
-    state = checkpoint.load(checkpoint.CheckpointFolder(run_dir / "checkpoints", 1).find(which))
-    env = make_evaluation_env(config, randomization, min(episodes, MAX_ROBOTS), seed)
-    try:
-        actor = make_actor(config, env)
-        load_policy_state(actor, env, state)
-        return evaluate(actor, env, episodes, seed)
-    finally:
-        env.close()
+class TrainedPolicy:
+    """A checkpoint of a run, to be judged or watched.
+
+    Args:
+        run_dir: The run folder.
+        which: ``best``, ``last``, or a number of frames.
+        randomization: How robots differ; None takes the run's own evaluation.
+
+    Raises:
+        UserError: If there is no such run or checkpoint, or it is damaged.
+    """
+
+    def __init__(self, run_dir: Path, which: str, randomization: RandomizationConfig | None = None) -> None:
+        self.config = load_config(run_dir)
+        self.randomization = randomization or self.config.evaluation.randomization
+        self._state = checkpoint.load(checkpoint.CheckpointFolder(run_dir / "checkpoints", 1).find(which))
+
+    def deploy(self, num_envs: int, seed: int) -> tuple[TensorDictModuleBase, TransformedRobotEnv]:
+        """Build the actor, and an env with the statistics that it was trained with."""
+        env = make_evaluation_env(self.config, self.randomization, num_envs, seed)
+        actor = make_actor(self.config, env)
+        load_policy_state(actor, env, self._state)
+        return actor, env
+
+    def evaluate(self, episodes: int, seed: int = FINAL_SEED) -> Evaluation:
+        """Judge it on so many goals."""
+        actor, env = self.deploy(min(episodes, MAX_ROBOTS), seed)
+        try:
+            return evaluate(actor, env, episodes, seed)
+        finally:
+            env.close()
 
 
 def _summary(config: TrainConfig, agent: Agent, clock: Clock, result: Evaluation) -> dict[str, Any]:

@@ -1,0 +1,56 @@
+# Set-up happens by itself: each target first brings .venv up to date with pyproject.toml and constraints.txt.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+ARGS ?=
+
+.PHONY: help train test bench check format build clean
+help:  ## Show this help
+	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## (.*)/  make \1\t\2/'
+
+$(BIN)/python:
+	@echo "==> Creating $(VENV)"
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --upgrade pip
+
+$(VENV)/.installed: pyproject.toml constraints.txt | $(BIN)/python
+	@echo "==> Installing physai into $(VENV)"
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable .
+	@touch $@
+
+$(VENV)/.installed-dev: $(VENV)/.installed
+	@echo "==> Installing the tools for tests and benchmarks into $(VENV)"
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev,bench]'
+	@touch $@
+
+train: $(VENV)/.installed  ## Train the two-link arm (ARGS="env=kuka_reacher seed=1" for more)
+	@echo "==> Training"
+	$(BIN)/python -m physai.train env=reacher $(ARGS)
+
+test: $(VENV)/.installed-dev  ## Run all tests (ARGS="-m 'not slow'" for the quick ones)
+	@echo "==> Testing"
+	$(BIN)/python -m pytest -n 2 --dist worksteal $(ARGS)
+
+bench: $(VENV)/.installed-dev  ## Measure speed against bare PyBullet and Stable-Baselines3
+	@echo "==> Measuring (takes minutes)"
+	$(BIN)/python -m physai.bench $(ARGS)
+
+check: $(VENV)/.installed-dev  ## Check format, lint and types
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+
+format: $(VENV)/.installed-dev  ## Format the code
+	$(BIN)/ruff format .
+	$(BIN)/ruff check --fix .
+
+build: $(VENV)/.installed-dev  ## Build a wheel and try it in an empty environment, from another folder
+	rm -rf dist build/wheel-test
+	$(BIN)/python -m build --wheel
+	$(PYTHON) -m venv build/wheel-test
+	build/wheel-test/bin/python -m pip install --quiet --constraint constraints.txt dist/*.whl
+	cd / && $(CURDIR)/build/wheel-test/bin/python -m physai.train --help > /dev/null
+	@echo "==> The wheel works: $$(ls dist/*.whl)"
+
+clean:  ## Remove what make created (not outputs/)
+	rm -rf $(VENV) build dist .pytest_cache .mypy_cache .ruff_cache

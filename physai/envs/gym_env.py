@@ -1,0 +1,173 @@
+"""The Gymnasium shells: one robot, or N as one vector env; neither needs TorchRL."""
+
+import time
+from collections.abc import Sequence
+from typing import Any
+
+import gymnasium
+import numpy as np
+import torch
+from gymnasium import spaces
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+from numpy.typing import NDArray
+
+from physai.config import compose, validate
+from physai.envs.simulation import EnvConfig, Simulation
+from physai.physics.viewer import Viewer, has_screen
+
+Array = NDArray[Any]
+
+
+def _simulate(env: str, overrides: Sequence[str], num_envs: int) -> Simulation:
+    config = validate(EnvConfig, compose("train", [f"env={env}", *overrides]).env)
+    return Simulation(config, num_envs, seed=0)
+
+
+def _spaces(simulation: Simulation) -> tuple[spaces.Box, spaces.Box]:
+    low, high = simulation.task.observation_bounds(simulation.spec, simulation.kinematics)
+    observation = spaces.Box(low.numpy(), high.numpy(), dtype=np.float32)
+    return observation, spaces.Box(-1.0, 1.0, (len(simulation.spec.joints),), np.float32)
+
+
+def _observe(simulation: Simulation) -> Array:
+    module = simulation.observation
+    with torch.no_grad():
+        observation, _ = module(simulation.joint_position, simulation.joint_velocity, simulation.goal)
+    return observation.numpy()
+
+
+class RobotGymEnv(gymnasium.Env[Array, Array]):
+    """One robot at a task, without randomization; observation and action as in ``physai.tasks``.
+
+    ``info`` holds ``is_success`` and ``distance`` (m).
+
+    Args:
+        env: A file of ``conf/env``.
+        render_mode: ``rgb_array`` renders on the CPU without a screen; ``human`` opens a PyBullet window.
+        overrides: Hydra overrides such as ``env.task.max_steps=100``.
+    """
+
+    metadata = {"render_modes": ["rgb_array", "human"], "render_fps": 50}  # noqa: RUF012
+
+    def __init__(self, env: str, render_mode: str | None = None, overrides: Sequence[str] = ()) -> None:
+        self.simulation = _simulate(env, overrides, 1)
+        self.metadata = {**self.metadata, "render_fps": round(1 / self.simulation.config.control_dt)}
+        if not has_screen():
+            self.metadata["render_modes"] = ["rgb_array"]
+        self.render_mode = render_mode
+        self.observation_space, self.action_space = _spaces(self.simulation)
+        self._viewer: Viewer | None = None
+        self._seeded = False
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Array, dict[str, Any]]:
+        """Start an episode."""
+        super().reset(seed=seed)
+        if seed is not None or not self._seeded:
+            self.simulation.seed(int(self.np_random.integers(2**63 - 1)))
+            self._seeded = True
+        self.simulation.reset()
+        self._show()
+        return _observe(self.simulation)[0], self._info(False)
+
+    def step(self, action: Array) -> tuple[Array, float, bool, bool, dict[str, Any]]:
+        """Apply an action [n] in [-1, 1] for one control period."""
+        reward, terminated, truncated = self.simulation.step(torch.as_tensor(action, dtype=torch.float32)[None])
+        self._show()
+        success = bool(terminated)
+        return _observe(self.simulation)[0], float(reward), success, bool(truncated), self._info(success)
+
+    def _info(self, success: bool) -> dict[str, Any]:
+        return {"is_success": success, "distance": float(self.simulation.distance)}
+
+    def _show(self) -> None:
+        if self.render_mode == "human":
+            self._picture()
+            time.sleep(self.simulation.config.control_dt)
+
+    def _picture(self) -> Array | None:
+        if self._viewer is None:
+            self._viewer = self.simulation.viewer(window=self.render_mode == "human")
+        return self._viewer.show(self.simulation.joint_position[0].numpy(), self.simulation.goal[0].numpy())
+
+    def render(self) -> Array | None:  # type: ignore[override]
+        """Return an image [height, width, 3] uint8 in the mode ``rgb_array``."""
+        return self._picture() if self.render_mode == "rgb_array" else None
+
+    def close(self) -> None:
+        """Free the simulation and the viewer."""
+        self.simulation.close()
+        if self._viewer is not None:
+            self._viewer.close()
+            self._viewer = None
+
+
+class RobotVectorEnv(VectorEnv[Array, Array, Array]):
+    """N robots in one process as a Gymnasium vector env; an episode that is over restarts at the next step.
+
+    Args:
+        env: A file of ``conf/env``.
+        num_envs: N.
+        render_mode: ``rgb_array`` shows the first robot.
+        overrides: Hydra overrides.
+    """
+
+    metadata = {  # noqa: RUF012
+        "autoreset_mode": AutoresetMode.NEXT_STEP,
+        "render_modes": ["rgb_array"],
+        "render_fps": 50,
+    }
+
+    def __init__(
+        self, env: str, num_envs: int = 1, render_mode: str | None = None, overrides: Sequence[str] = ()
+    ) -> None:
+        self.simulation = _simulate(env, overrides, num_envs)
+        self.metadata = {**self.metadata, "render_fps": round(1 / self.simulation.config.control_dt)}
+        self.num_envs = num_envs
+        self.render_mode = render_mode
+        self.single_observation_space, self.single_action_space = _spaces(self.simulation)
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self._over = torch.zeros(num_envs, dtype=torch.bool)
+        self._viewer: Viewer | None = None
+        self._seeded = False
+
+    def reset(  # type: ignore[override]
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Array, dict[str, Any]]:
+        """Start an episode in every row."""
+        super().reset(seed=seed)
+        if seed is not None or not self._seeded:
+            self.simulation.seed(int(self.np_random.integers(2**63 - 1)))
+            self._seeded = True
+        self.simulation.reset()
+        self._over = torch.zeros(self.num_envs, dtype=torch.bool)
+        return _observe(self.simulation), {}
+
+    def step(self, actions: Array) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
+        """Apply actions [N, n]; rows whose episode is over start a new one instead."""
+        fresh = self._over
+        reward, terminated, truncated = self.simulation.step(torch.as_tensor(actions, dtype=torch.float32))
+        if fresh.any():
+            self.simulation.reset(fresh)
+            reward, terminated, truncated = (value.masked_fill(fresh[:, None], 0) for value in (reward, terminated, truncated))
+        self._over = (terminated | truncated)[:, 0]
+        info = {"is_success": terminated[:, 0].numpy(), "distance": self.simulation.distance[:, 0].numpy()}
+        rows = (value[:, 0].numpy() for value in (reward, terminated, truncated))
+        return _observe(self.simulation), *rows, info
+
+    def render(self) -> tuple[Array, ...] | None:
+        """Return an image of the first robot."""
+        if self.render_mode != "rgb_array":
+            return None
+        if self._viewer is None:
+            self._viewer = self.simulation.viewer()
+        image = self._viewer.show(self.simulation.joint_position[0].numpy(), self.simulation.goal[0].numpy())
+        return None if image is None else (image,)
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """Free the simulation and the viewer."""
+        self.simulation.close()
+        if self._viewer is not None:
+            self._viewer.close()
+            self._viewer = None

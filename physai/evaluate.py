@@ -1,0 +1,64 @@
+"""``python -m physai.evaluate``: judge the policy of a run (see ``--help``)."""
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from omegaconf import DictConfig
+
+from physai import cli
+from physai.config import Config, Count, validate
+
+if TYPE_CHECKING:
+    from physai.training.run import TrainedPolicy
+
+
+class PolicyChoice(Config):
+    """Which policy, and how the robots differ that it drives."""
+
+    run: str
+    checkpoint: str | int
+    randomization: dict[str, Any] | None
+
+    def load(self) -> "TrainedPolicy":
+        """Read it; raises a UserError if something is missing or damaged."""
+        from physai.training.run import TrainedPolicy
+        from physai.transforms import RandomizationConfig
+
+        chosen = None
+        if self.randomization is not None:
+            chosen = validate(RandomizationConfig, DictConfig(self.randomization))
+        return TrainedPolicy(Path(self.run), str(self.checkpoint), chosen)
+
+
+class EvaluateConfig(PolicyChoice):
+    """``conf/evaluate.yaml``."""
+
+    episodes: Count
+    seed: int | None
+
+
+def _check(node: DictConfig) -> None:
+    validate(EvaluateConfig, node).load()
+
+
+def _evaluate(node: DictConfig, _: Path) -> None:
+    from physai.training import checkpoint
+    from physai.training.run import FINAL_SEED, print_summary
+
+    config = validate(EvaluateConfig, node)
+    policy = config.load()
+    seed = FINAL_SEED if config.seed is None else config.seed
+    summary = policy.evaluate(config.episodes, seed).summary() | {
+        "randomization": policy.randomization.name,
+        "checkpoint": config.checkpoint,
+        "episodes": config.episodes,
+        "seed": seed,
+    }
+    output = Path(config.run) / f"evaluation_{policy.randomization.name}.json"
+    checkpoint.write(output, json.dumps(summary, indent=2).encode())
+    print_summary(summary, f"{config.run}: {config.checkpoint}, on {config.episodes:,} goals")
+
+
+if __name__ == "__main__":
+    cli.main("evaluate", _evaluate, _check)

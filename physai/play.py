@@ -1,0 +1,90 @@
+"""``python -m physai.play``: watch the policy of a run (see ``--help``)."""
+
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from omegaconf import DictConfig
+
+from physai import cli
+from physai.config import Count, validate
+from physai.errors import UserError
+from physai.evaluate import PolicyChoice
+
+if TYPE_CHECKING:
+    import numpy as np
+
+_PAUSE = 15  # frames to look at the arm at its goal
+
+
+class PlayConfig(PolicyChoice):
+    """``conf/play.yaml``."""
+
+    goals: Count
+    seed: int
+    render: Literal["video", "human"]
+    output: str | None
+
+
+def _check(node: DictConfig) -> None:
+    config = validate(PlayConfig, node)
+    if config.output is not None and Path(config.output).suffix not in (".mp4", ".gif"):
+        raise UserError(f"output: '{config.output}' must end in .mp4 or .gif")
+    config.load()
+
+
+def _play(node: DictConfig, _: Path) -> None:
+    import torch
+    from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+    config = validate(PlayConfig, node)
+    actor, env = config.load().deploy(1, config.seed)
+    human = config.render == "human"
+    viewer = env.simulation.viewer(window=human)
+    dt = env.simulation.config.control_dt
+    frames: list[np.ndarray] = []
+
+    def show(times: int = 1) -> None:
+        for _ in range(times):
+            image = viewer.show(env.simulation.joint_position[0].numpy(), env.simulation.goal[0].numpy())
+            if image is None:
+                time.sleep(dt)
+            else:
+                frames.append(image)
+
+    reached = 0
+    with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
+        for goal in range(config.goals):
+            tensordict = env.reset()
+            show()
+            while not tensordict["done"].any():
+                tensordict = env.step(actor(tensordict))["next"]
+                show()
+            reached += int(tensordict["terminated"])
+            outcome = "reached" if tensordict["terminated"] else "missed"
+            print(f"goal {goal + 1}: {outcome} in {tensordict['episode_length'].item() * dt:.2f} s")
+            show(_PAUSE)
+    viewer.close()
+    env.close()
+    print(f"{reached} of {config.goals} goals reached")
+    if not human:
+        output = Path(config.output) if config.output else Path(config.run) / "play.mp4"
+        _write(output, frames, round(1 / dt))
+        print(f"Video: {output}")
+
+
+def _write(output: Path, frames: "list[np.ndarray]", frames_per_second: int) -> None:
+    import imageio.v3 as imageio
+
+    try:
+        if output.suffix == ".gif":
+            # Viewers of GIFs slow down what is faster than 50 Hz, and every second frame halves the file.
+            imageio.imwrite(output, frames[::2], duration=2000 / frames_per_second, loop=0)
+        else:
+            imageio.imwrite(output, frames, fps=frames_per_second, macro_block_size=8)
+    except OSError as error:
+        raise UserError(f"cannot write {output}: {error.strerror or error}") from None
+
+
+if __name__ == "__main__":
+    cli.main("play", _play, _check)
