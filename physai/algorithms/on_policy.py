@@ -29,7 +29,7 @@ class OnPolicy:
     The factories are what ``_partial_: true`` makes of a config node.
 
     Args:
-        actor: The policy; its ``loss_keys`` tell the loss what was sampled.
+        actor: The policy; its ``dist_sample_keys`` and ``log_prob_keys`` tell the loss what was sampled.
         critic: The value network.
         frames_per_batch: Size of the batches to come.
         loss: Makes the loss module from ``actor_network`` and ``critic_network``; all its ``loss_*`` outputs are summed.
@@ -60,7 +60,6 @@ class OnPolicy:
                 f"collector.frames_per_batch={frames_per_batch}"
             )
         self.loss = loss(actor_network=actor, critic_network=critic)
-        self.loss.set_keys(**getattr(actor, "loss_keys", {}))
         self.advantage = advantage(value_network=critic)
         self.buffer = buffer
         self.optimizer = optimizer(self.loss.parameters())

@@ -60,7 +60,9 @@ class GaussianActor(TensorDictModuleBase):
     """
 
     out_keys = ("action", "latent_action", "action_log_prob")
-    loss_keys = {"action": "latent_action", "sample_log_prob": "action_log_prob"}  # noqa: RUF012
+    # Where TorchRL's losses look for what was sampled:
+    dist_sample_keys = ("latent_action",)
+    log_prob_keys = ("action_log_prob",)
 
     def __init__(
         self,

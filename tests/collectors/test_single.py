@@ -1,0 +1,53 @@
+import pytest
+import torch
+
+from physai.collectors import CollectorConfig, make_collector
+from physai.envs.make import make
+from physai.errors import UserError
+from physai.policies import GaussianActor
+
+
+def collector(frames=256, total=1024, seed=0):
+    torch.manual_seed(0)
+    env = make("reacher", num_envs=16, seed=seed)
+    actor = GaussianActor(8, 2, ["normalized_observation"], [16], "torch.nn.Tanh", 1.0)
+    return make_collector(CollectorConfig(num_envs=16, frames_per_batch=frames), env, actor, total)
+
+
+def test_one_set_of_statistics_holds_for_a_whole_batch():
+    source = collector()
+    normalization = source.env.normalization
+    for batch in source:
+        expected = normalization.normalize(batch["observation"])
+        assert torch.equal(batch["normalized_observation"], expected)
+        normalization.update(batch["observation"])
+    source.shutdown()
+
+
+def test_total_frames_are_rounded_up_to_whole_batches():
+    source = collector(frames=256, total=300)
+    assert [batch.numel() for batch in source] == [256, 256]
+    source.shutdown()
+
+
+def test_state_continues_bit_for_bit_in_a_new_collector():
+    source = collector(seed=3)
+    batches = iter(source)
+    next(batches)
+    state, random = source.state(), torch.get_rng_state()
+    expected = next(batches).clone()
+    source.shutdown()
+    other = collector(seed=99)
+    other.set_state(state)
+    torch.set_rng_state(random)
+    got = next(iter(other))
+    other.shutdown()
+    for key in expected.keys(True, True):
+        assert torch.equal(expected[key], got[key]), key
+
+
+def test_a_batch_must_be_whole_steps_of_all_robots():
+    env = make("reacher", num_envs=16)
+    with pytest.raises(UserError, match="multiple of"):
+        make_collector(CollectorConfig(num_envs=16, frames_per_batch=100), env, None, 1000)
+    env.close()

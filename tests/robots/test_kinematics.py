@@ -1,0 +1,138 @@
+import numpy as np
+import pybullet as bullet
+import pytest
+import torch
+
+from physai.robots import ForwardKinematics, RobotConfig, RobotSpec
+
+SEVEN = [f"lbr_iiwa_joint_{number}" for number in range(1, 8)]
+
+
+@pytest.fixture(scope="module")
+def spec(any_env):
+    return RobotSpec.from_config(any_env.robot)
+
+
+def link_positions(spec: RobotSpec, joint_position: np.ndarray) -> np.ndarray:
+    """Where PyBullet puts the frame of the end effector in the robot's own URDF; all other joints are at zero."""
+    client = bullet.connect(bullet.DIRECT)
+    try:
+        body = bullet.loadURDF(str(spec.urdf), useFixedBase=True, physicsClientId=client)
+        infos = [bullet.getJointInfo(body, index, client) for index in range(bullet.getNumJoints(body, client))]
+        joints = {info[1].decode(): info[0] for info in infos}
+        links = {info[12].decode(): info[0] for info in infos}
+        positions = []
+        for row in joint_position.tolist():
+            for name, value in zip(spec.joints, row, strict=True):
+                bullet.resetJointState(body, joints[name], value, physicsClientId=client)
+            state = bullet.getLinkState(
+                body, links[spec.end_effector], computeForwardKinematics=1, physicsClientId=client
+            )
+            positions.append(state[4])
+        return np.array(positions)
+    finally:
+        bullet.disconnect(client)
+
+
+def reference(spec: RobotSpec, joint_position: np.ndarray) -> np.ndarray:
+    """The textbook product of homogeneous matrices in float64, [3]."""
+    angles = dict(zip(spec.joints, joint_position, strict=True))
+    pose = np.eye(4)
+    for joint in spec.chain:
+        pose = pose @ (np.eye(4) if joint.origin is None else joint.origin)
+        angle = angles.get(joint.name, 0.0)
+        x, y, z = joint.axis / np.linalg.norm(joint.axis) if joint.axis is not None else (0.0, 0.0, 1.0)
+        cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+        turn = np.eye(4)
+        turn[:3, :3] = np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
+        pose = pose @ turn
+    return pose[:3, 3]
+
+
+def random_positions(rows: int, joints: int, seed: int = 0) -> torch.Tensor:
+    return torch.empty(rows, joints).uniform_(-6.0, 6.0, generator=torch.Generator().manual_seed(seed))
+
+
+def test_end_effector_is_where_pybullet_has_it_on_a_thousand_poses(spec):
+    joint_position = random_positions(1000, len(spec.joints))
+    found = ForwardKinematics(spec)(joint_position).numpy()
+    np.testing.assert_allclose(found, link_positions(spec, joint_position.numpy()), rtol=0, atol=1e-5)
+
+
+def test_all_seven_joints_of_the_kuka_match_pybullet(kuka_reacher):
+    config = RobotConfig.model_validate({**kuka_reacher.robot.model_dump(), "joints": SEVEN, "home": [0.0] * 7})
+    spec = RobotSpec.from_config(config)
+    joint_position = random_positions(200, 7)
+    found = ForwardKinematics(spec)(joint_position).numpy()
+    np.testing.assert_allclose(found, link_positions(spec, joint_position.numpy()), rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_any_chain_of_turned_joints_matches_pybullet(tmp_path, seed):
+    random = np.random.default_rng(seed)
+    inertial = '<inertial><mass value="1"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial>'
+    kinds = ["fixed", "revolute", "continuous", "fixed", "revolute", "revolute", "fixed"]
+    parts = ['<link name="l0"/>']
+    for index, kind in enumerate(kinds):
+        axis = random.normal(size=3)
+        axis /= np.linalg.norm(axis)
+        xyz, rpy = random.uniform(-0.3, 0.3, 3), random.uniform(-1.5, 1.5, 3)
+        text = [" ".join(f"{number:.12f}" for number in vector) for vector in (xyz, rpy, axis)]
+        parts.append(
+            f'<joint name="j{index}" type="{kind}"><parent link="l{index}"/><child link="l{index + 1}"/>'
+            f'<origin xyz="{text[0]}" rpy="{text[1]}"/><axis xyz="{text[2]}"/>'
+            f'<limit lower="-7" upper="7" effort="1" velocity="1"/></joint>'
+            f'<link name="l{index + 1}">{inertial}</link>'
+        )
+    path = tmp_path / "chain.urdf"
+    path.write_text(f'<robot name="chain">{"".join(parts)}</robot>')
+    # joint j4 is left out: it is held at zero, in the middle of the chain
+    config = RobotConfig(name="chain", urdf=str(path), joints=["j1", "j2", "j5"], end_effector="l7", home=[0.0] * 3)
+    spec = RobotSpec.from_config(config)
+    joint_position = random_positions(50, 3, seed)
+    found = ForwardKinematics(spec)(joint_position).numpy()
+    np.testing.assert_allclose(found, link_positions(spec, joint_position.numpy()), rtol=0, atol=1e-5)
+
+
+def test_slopes_equal_finite_differences_of_textbook_kinematics(spec):
+    joint_position = random_positions(50, len(spec.joints), seed=1)
+    slopes = ForwardKinematics(spec).linearize(joint_position)[:, 1:].numpy()
+    step = 1e-6
+    for row, q in enumerate(joint_position.double().numpy()):
+        for joint in range(len(spec.joints)):
+            shift = step * np.eye(len(spec.joints))[joint]
+            slope = (reference(spec, q + shift) - reference(spec, q - shift)) / (2 * step)
+            np.testing.assert_allclose(slopes[row, joint], slope, rtol=0, atol=2e-6)
+
+
+def test_slopes_equal_the_gradient_and_the_first_row_the_position(spec):
+    kinematics = ForwardKinematics(spec).double()
+    for q in random_positions(20, len(spec.joints), seed=2).double():
+        position_and_slopes = kinematics.linearize(q)
+        jacobian = torch.autograd.functional.jacobian(kinematics, q)
+        torch.testing.assert_close(position_and_slopes[1:], jacobian.T, rtol=0, atol=1e-12)
+        assert torch.equal(position_and_slopes[0], kinematics(q))
+
+
+@pytest.mark.parametrize("shape", [(), (1,), (7,), (3, 5)])
+def test_scripted_kinematics_equals_eager_bit_for_bit(spec, shape):
+    kinematics = ForwardKinematics(spec)
+    scripted = torch.jit.script(kinematics)
+    q = random_positions(max(1, int(np.prod(shape))), len(spec.joints)).reshape(*shape, len(spec.joints))
+    for _ in range(4):  # the profiling executor changes what it runs in the first calls
+        assert torch.equal(scripted(q), kinematics(q))
+        assert torch.equal(scripted.linearize(q), kinematics.linearize(q))
+    assert kinematics(q).shape == (*shape, 3)
+    assert kinematics.linearize(q).shape == (*shape, 1 + len(spec.joints), 3)
+
+
+def test_reach_bounds_the_distance_from_the_first_joint_and_is_attained_by_the_planar_arm(reacher, kuka_reacher):
+    for config in (reacher, kuka_reacher):
+        spec = RobotSpec.from_config(config.robot)
+        kinematics = ForwardKinematics(spec)
+        shoulder = torch.tensor(spec.chain[0].origin[:3, 3], dtype=torch.float32)
+        distance = torch.linalg.vector_norm(kinematics(random_positions(1000, 2)) - shoulder, dim=-1)
+        assert distance.max() <= kinematics.reach + 1e-6
+    planar = ForwardKinematics(RobotSpec.from_config(reacher.robot))
+    assert planar.reach == pytest.approx(0.55)
+    torch.testing.assert_close(planar(torch.zeros(2)), torch.tensor([0.55, 0.0, 0.0]))
