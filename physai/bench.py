@@ -6,12 +6,14 @@ import os
 import platform
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from importlib.metadata import version
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pybullet as bullet
@@ -44,9 +46,18 @@ JUDGE_EVERY = 8192  # frames; one batch of Stable-Baselines3, two of physai
 SB3_ENVS = 4
 SB3_THREADS = (1, 2)
 # The numbers that users know; all but ent_coef are also its defaults.
-SB3_PPO = {"learning_rate": 3e-4, "n_steps": 2048, "batch_size": 64, "n_epochs": 10} | {
-    "gamma": 0.99, "gae_lambda": 0.95, "clip_range": 0.2, "ent_coef": 0.005, "vf_coef": 0.5, "max_grad_norm": 0.5
-}  # fmt: skip
+SB3_PPO: dict[str, Any] = {
+    "learning_rate": 3e-4,
+    "n_steps": 2048,
+    "batch_size": 64,
+    "n_epochs": 10,
+    "gamma": 0.99,
+    "gae_lambda": 0.95,
+    "clip_range": 0.2,
+    "ent_coef": 0.005,
+    "vf_coef": 0.5,
+    "max_grad_norm": 0.5,
+}
 
 
 def main() -> None:
@@ -115,46 +126,45 @@ def median_speeds(*sides: Callable[[], int], rounds: int) -> list[float]:
     ]
 
 
-class BareLoop:
-    """The least that one can do with PyBullet: command, step, read; in worlds as small as physai's.
+@contextmanager
+def bare_loop(spec: RobotSpec, control_dt: float, commands: np.ndarray) -> Iterator[Callable[[], int]]:
+    """Make the least that one can do with PyBullet: command, step, read; in worlds as small as physai's.
 
     Args:
         spec: The robot.
         control_dt: Control period, s; one physics step.
         commands: Joint velocities to play, rad/s, [T, N, n].
+
+    Yields:
+        A function that plays all commands and returns the number of robot-steps.
     """
+    steps, robots, _ = commands.shape
+    sizes = [min(ROBOTS_PER_WORLD, robots - first) for first in range(0, robots, ROBOTS_PER_WORLD)]
+    worlds = [_bare_world(spec, size, control_dt) for size in sizes]
+    client, (body, *_) = worlds[0]
+    infos = [bullet.getJointInfo(body, joint, client) for joint in range(bullet.getNumJoints(body, client))]
+    indices = {info[1].decode(): info[0] for info in infos}
+    joints, efforts = [indices[name] for name in spec.joints], spec.effort_limit.tolist()
+    plan = commands.tolist()
 
-    def __init__(self, spec: RobotSpec, control_dt: float, commands: np.ndarray) -> None:
-        robots = commands.shape[1]
-        sizes = [min(ROBOTS_PER_WORLD, robots - first) for first in range(0, robots, ROBOTS_PER_WORLD)]
-        self._worlds = [_bare_world(spec, size, control_dt) for size in sizes]
-        client, (body, *_) = self._worlds[0]
-        infos = [
-            bullet.getJointInfo(body, joint, client) for joint in range(bullet.getNumJoints(body, client))
-        ]
-        indices = {info[1].decode(): info[0] for info in infos}
-        self._joints = [indices[name] for name in spec.joints]
-        self._efforts = spec.effort_limit.tolist()
-        self._commands = commands.tolist()
-
-    def run(self) -> int:
-        """Play all commands; return the number of robot-steps."""
+    def play() -> int:
         command, step, read = bullet.setJointMotorControl2, bullet.stepSimulation, bullet.getJointStates
-        joints, efforts, mode = self._joints, self._efforts, bullet.VELOCITY_CONTROL
-        for commands in self._commands:
-            rows = iter(commands)
-            for client, bodies in self._worlds:
+        mode = bullet.VELOCITY_CONTROL
+        for targets in plan:
+            rows = iter(targets)
+            for client, bodies in worlds:
                 for body in bodies:
                     for joint, target, effort in zip(joints, next(rows), efforts):  # noqa: B905
                         command(body, joint, mode, 0.0, target, effort, 0.1, 1.0, 0.0, client)
                 step(client)
                 for body in bodies:
                     read(body, joints, client)
-        return len(self._commands) * len(self._commands[0])
+        return steps * robots
 
-    def close(self) -> None:
-        """Free the worlds."""
-        for client, _ in self._worlds:
+    try:
+        yield play
+    finally:
+        for client, _ in worlds:
             bullet.disconnect(client)
 
 
@@ -170,31 +180,18 @@ def _bare_world(spec: RobotSpec, robots: int, time_step: float) -> tuple[int, li
     return client, bodies
 
 
-@dataclass(frozen=True)
-class CollectionSpeed:
-    """Robot-steps per second with so many robots."""
-
-    robots: int
-    bare: float
-    collector: float
-
-
-def measure_collection(seed: int) -> tuple[int, list[CollectionSpeed]]:
-    """Return the default number of robots, and the speeds with that and with all of ``ROBOTS``."""
+def measure_collection(seed: int) -> tuple[int, dict[int, list[float]]]:
+    """Return the default number of robots; and by their number, robot-steps/s bare and of the collector."""
     config = _config(seed)
     torch.set_num_threads(config.threads)
-    speeds = []
+    speeds = {}
     for robots in sorted({*ROBOTS, config.collector.num_envs}):
-        speed = _collection_speed(config, robots)
-        print(
-            f"{robots:>5,} robots: collector {speed.collector:>8,.0f}/s, bare {speed.bare:>8,.0f}/s",
-            flush=True,
-        )
-        speeds.append(speed)
+        bare, collector = speeds[robots] = _collection_speeds(config, robots)
+        print(f"{robots:>5,} robots: collector {collector:>8,.0f}/s, bare {bare:>8,.0f}/s", flush=True)
     return config.collector.num_envs, speeds
 
 
-def _collection_speed(config: TrainConfig, robots: int) -> CollectionSpeed:
+def _collection_speeds(config: TrainConfig, robots: int) -> list[float]:
     steps = config.collector.frames_per_batch // config.collector.num_envs
     size = CollectorConfig(num_envs=robots, frames_per_batch=steps * robots)
     total_frames = (1 + ROUNDS) * BATCHES_PER_ROUND * size.frames_per_batch
@@ -210,18 +207,14 @@ def _collection_speed(config: TrainConfig, robots: int) -> CollectionSpeed:
             frames += batch.numel()
         return frames
 
-    # As an untrained policy's, the commands change all the time: a motor that has settled is cheaper to solve.
-    shape, limit = (
-        (BATCHES_PER_ROUND * steps, robots, len(env.simulation.spec.joints)),
-        config.env.max_velocity,
-    )
-    commands = np.random.default_rng(config.seed).uniform(-limit, limit, shape)
-    bare = BareLoop(env.simulation.spec, config.env.control_dt, commands)
-    try:
-        return CollectionSpeed(robots, *median_speeds(bare.run, collect, rounds=ROUNDS))
-    finally:
-        bare.close()
-        collector.shutdown()
+    # Like an untrained policy's, the commands change all the time: a settled motor is cheaper to solve.
+    shape = (BATCHES_PER_ROUND * steps, robots, len(env.simulation.spec.joints))
+    commands = config.env.max_velocity * np.random.default_rng(config.seed).uniform(-1, 1, shape)
+    with bare_loop(env.simulation.spec, config.env.control_dt, commands) as bare:
+        try:
+            return median_speeds(bare, collect, rounds=ROUNDS)
+        finally:
+            collector.shutdown()
 
 
 @dataclass
@@ -270,7 +263,7 @@ def run_race(name: str, learn: Callable[[], int], judge: Callable[[], float], ma
 
 
 def measure_training(seed: int, seeds: int, sb3_frames: int) -> tuple[list[Race], Race]:
-    """Race on the robot of the URDF, without randomization: physai with several seeds, then Stable-Baselines3."""
+    """Race on one robot that is not randomized: physai with so many seeds, then Stable-Baselines3."""
     configs = [_config(one, "randomization=none") for one in range(seed, seed + seeds)]
     judge = make_evaluation_env(configs[0], configs[0].randomization, GOALS, GOALS_SEED)
     try:
@@ -305,8 +298,8 @@ def _race_sb3(seed: int, judge: TransformedRobotEnv, max_frames: int) -> Race:
 
     envs = make_vec_env("physai/Reacher-v0", SB3_ENVS)  # a DummyVecEnv; PPO seeds it
 
-    def make_model() -> PPO:
-        return PPO("MlpPolicy", envs, seed=seed, device="cpu", **SB3_PPO)
+    def make_model(**changed: int) -> PPO:
+        return PPO("MlpPolicy", envs, seed=seed, device="cpu", **SB3_PPO | changed)
 
     def learn(model: PPO, threads: int) -> int:
         torch.set_num_threads(threads)
@@ -317,7 +310,7 @@ def _race_sb3(seed: int, judge: TransformedRobotEnv, max_frames: int) -> Race:
     def act(observation: torch.Tensor) -> torch.Tensor:
         return torch.from_numpy(model.predict(observation.numpy(), deterministic=True)[0])
 
-    trial = make_model()
+    trial = make_model(n_steps=256)
     speeds = median_speeds(*(partial(learn, trial, threads) for threads in SB3_THREADS), rounds=1)
     threads = SB3_THREADS[speeds.index(max(speeds))]
     measured = ", ".join(f"{speed:,.0f}/s with {n}" for n, speed in zip(SB3_THREADS, speeds, strict=True))
@@ -336,26 +329,24 @@ def _race_sb3(seed: int, judge: TransformedRobotEnv, max_frames: int) -> Race:
 
 
 def _config(seed: int, *overrides: str) -> TrainConfig:
-    node = compose("train", ["env=reacher", f"seed={seed}", *overrides])
-    del node["resume"]
-    return validate(TrainConfig, node)
+    return validate(TrainConfig, compose("train", ["env=reacher", f"seed={seed}", *overrides]))
 
 
 def _table(title: str, *columns: str) -> Table:
-    table = Table(title=title, title_justify="left")
+    table = Table(title=title, title_justify="left", min_width=len(title))
     for column in columns:
         table.add_column(column, justify="right")
     return table
 
 
-def collection_table(default: int, speeds: list[CollectionSpeed]) -> Table:
+def collection_table(default: int, speeds: dict[int, list[float]]) -> Table:
     """Show robot-steps per second; the default number of robots stands out."""
     title = "Collection, robot-steps/s: one process, one thread, randomization=default"
     table = _table(title, "robots", "bare PyBullet", "TorchRL collector", "ratio")
-    for speed in speeds:
-        ratio, robots = f"{speed.collector / speed.bare:.2f}", f"{speed.robots:,}"
-        style, mark = ("bold", " (default)") if speed.robots == default else (None, "")
-        table.add_row(robots + mark, f"{speed.bare:,.0f}", f"{speed.collector:,.0f}", ratio, style=style)
+    for robots, (bare, collector) in speeds.items():
+        style, mark = ("bold", " (default)") if robots == default else (None, "")
+        figures = f"{bare:,.0f}", f"{collector:,.0f}", f"{collector / bare:.2f}"
+        table.add_row(f"{robots:,}{mark}", *figures, style=style)
     return table
 
 

@@ -4,7 +4,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from omegaconf import DictConfig, open_dict
+from omegaconf import DictConfig
 
 from physai import cli
 from physai.errors import UserError
@@ -29,14 +29,12 @@ def _config(node: DictConfig) -> "TrainConfig":
     from physai.config import validate
     from physai.training.config import TrainConfig
 
-    with open_dict(node):
-        node.pop("resume", None)
     return validate(TrainConfig, node)
 
 
 def _check(node: DictConfig) -> None:
     """Build every part of a run in small, so that whatever is wrong shows before a run folder exists."""
-    from physai.training.agent import Agent, make_logger  # noqa: F401
+    from physai.training.agent import Agent
 
     config = _config(node)
     Agent.build(config).close()

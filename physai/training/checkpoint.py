@@ -54,7 +54,8 @@ def load(path: Path) -> dict[str, Any]:
     except FileNotFoundError:
         raise UserError(f"{path}: no such checkpoint") from None
     except (RuntimeError, EOFError, pickle.UnpicklingError, ValueError, KeyError, OSError) as error:
-        raise UserError(f"{path}: the checkpoint is damaged ({str(error).splitlines()[0][:80]})") from None
+        reason = (str(error) or type(error).__name__).splitlines()[0][:80]
+        raise UserError(f"{path}: the checkpoint is damaged ({reason})") from None
     if not isinstance(content, dict) or content.get("format") != _FORMAT:
         raise UserError(f"{path}: not a checkpoint of this version of physai")
     return content

@@ -50,3 +50,4 @@ class TrainConfig(Config):
     total_frames: Count
     device: Literal["cpu"]
     threads: Count
+    resume: None  # the command takes it before a config is made

@@ -36,7 +36,6 @@ def load_config(run_dir: Path) -> TrainConfig:
         raise UserError(f"{run_dir}: no run there (it has no .hydra/config.yaml)")
     try:
         node = OmegaConf.load(path)
-        node.pop("resume", None)
     except Exception as error:  # whatever YAML makes of a truncated file
         raise UserError(f"{path}: the run's config is damaged ({' '.join(str(error).split())[:80]})") from None
     try:

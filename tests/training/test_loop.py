@@ -1,0 +1,192 @@
+"""Whole runs at small size: reproducible, interruptible, and stopped by what is not finite."""
+
+import json
+import os
+import signal
+import time
+
+import pytest
+import torch
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from physai.errors import UserError
+from physai.training.checkpoint import load
+from physai.training.loop import train
+from physai.training.run import run_training
+from tests.training.small import SMALL, command, metrics, small_config
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """A run, in a folder as the command leaves it."""
+    folder = tmp_path_factory.mktemp("finished")
+    process = command("train", *SMALL, "hydra.run.dir=run", cwd=folder)
+    output = process.communicate()[0]
+    assert process.returncode == 0, output
+    return folder / "run", output
+
+
+def digest(run):
+    return json.loads((run / "summary.json").read_text())["weights_sha256"]
+
+
+def test_a_run_folder_tells_its_whole_story(finished):
+    run, output = finished
+    summary = json.loads((run / "summary.json").read_text())
+    assert {
+        "success_rate",
+        "success_ci",
+        "steps_to_goal",
+        "final_distance",
+        "return",
+        "frames",
+        "train_seconds",
+        "frames_per_second",
+        "weights_sha256",
+        "seed",
+        "git_commit",
+        "randomization",
+    } <= set(summary)
+    assert summary["frames"] == 16384
+    assert (run / "training.png").read_bytes().startswith(b"\x89PNG")
+    assert [int(row["frames"]) for row in metrics(run)] == list(range(1024, 16385, 1024))
+    assert len((run / "episodes.csv").read_text().splitlines()) > 10
+    assert "success rate" in output and "95 % interval" in output
+    events = EventAccumulator(str(run / "tensorboard")).Reload()
+    assert {"episode/return", "loss_objective", "kl_approx", "lr", "time/frames_per_second", "grad_norm"} <= set(
+        events.Tags()["scalars"]
+    )
+
+
+def test_one_seed_gives_one_run_and_another_seed_another(finished, tmp_path):
+    run, _ = finished
+    same, other = tmp_path / "same", tmp_path / "other"
+    for path, seed in ((same, 0), (other, 1)):
+        path.mkdir()
+        agent, _ = train(small_config(f"seed={seed}"), path, resume=False)
+        agent.close()
+        if path is same:
+            assert agent.weights_sha256() == digest(run)
+        else:
+            assert agent.weights_sha256() != digest(run)
+    assert metrics(same) == metrics(run)
+    assert (same / "episodes.csv").read_bytes() == (run / "episodes.csv").read_bytes()
+    assert metrics(other) != metrics(run)
+
+
+def wait_until(condition, process, seconds=60):
+    end = time.monotonic() + seconds
+    while not condition() and process.poll() is None and time.monotonic() < end:
+        time.sleep(0.0005)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("moment", [0.0, 0.13, 0.38, 0.71, "writing"])
+def test_a_run_killed_at_any_moment_and_resumed_ends_like_the_uninterrupted_one(finished, tmp_path, moment):
+    run, _ = finished
+    checkpoints = tmp_path / "run" / "checkpoints"
+    process = command("train", *SMALL, "hydra.run.dir=run", cwd=tmp_path)
+    if moment == "writing":
+        wait_until(lambda: checkpoints.is_dir() and len(list(checkpoints.glob("0*.pt"))) >= 2, process)
+        wait_until(lambda: any(checkpoints.glob(".*.tmp")), process)
+    else:
+        wait_until((tmp_path / "run" / "metrics.csv").is_file, process)
+        time.sleep(moment)
+    process.kill()
+    assert process.wait() == -signal.SIGKILL
+    resumed = command("train", "resume=run", cwd=tmp_path)
+    output = resumed.communicate()[0]
+    assert resumed.returncode == 0, output
+    assert digest(tmp_path / "run") == digest(run)
+    assert metrics(tmp_path / "run") == metrics(run)
+    assert (tmp_path / "run" / "episodes.csv").read_bytes() == (run / "episodes.csv").read_bytes()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_stopped_run_saves_says_how_to_go_on_and_goes_on(finished, tmp_path, number, code):
+    process = command("train", *SMALL, "checkpoint.every_frames=1000000", "hydra.run.dir=run", cwd=tmp_path)
+    wait_until((tmp_path / "run" / "metrics.csv").is_file, process)
+    os.kill(process.pid, number)
+    output = process.communicate()[0]
+    assert process.returncode == code
+    assert "python -m physai.train resume=run" in output
+    assert len(list((tmp_path / "run" / "checkpoints").glob("0*.pt"))) == 2  # the start, and where it stopped
+    resumed = command("train", "resume=run", cwd=tmp_path)
+    output = resumed.communicate()[0]
+    assert resumed.returncode == 0, output
+    assert digest(tmp_path / "run") == digest(finished[0])
+
+
+def test_resuming_a_complete_run_shows_its_result(finished, capsys):
+    run, _ = finished
+    before = digest(run)
+    run_training(small_config(), run, resume=True)
+    assert "complete already" in capsys.readouterr().out
+    assert digest(run) == before
+
+
+def test_a_loss_that_explodes_stops_the_run_and_keeps_the_evidence(tmp_path):
+    config = small_config("algo.optimizer.lr=1e30", "algo.scheduler=null")
+    with pytest.raises(UserError, match=r"iteration \d+: .* is not finite") as stopped:
+        train(config, tmp_path, resume=False)
+    evidence = load(tmp_path / "not_finite.pt")
+    assert "observation" in str(evidence["batch"].keys())
+    kept = sorted((tmp_path / "checkpoints").glob("0*.pt"))[-1]
+    assert str(kept) in str(stopped.value)
+    weights = load(kept)["actor"]
+    assert all(torch.isfinite(value).all() for value in weights.values())
+
+
+def test_a_simulation_that_is_not_finite_stops_the_run(tmp_path, monkeypatch):
+    from physai.envs.simulation import Simulation
+
+    reset = Simulation.reset
+    calls = 0
+
+    def poisoned(self, rows=None, parameters=None):
+        nonlocal calls
+        calls += 1
+        reset(self, rows, parameters)
+        if calls == 30:  # a broken model would do the same to the joint states
+            self.physics.set_state(self.physics.state() | {"joint_velocity": self.physics.state()["joint_velocity"] * float("nan")})
+            self._read(*self.physics.joint_state())
+
+    monkeypatch.setattr(Simulation, "reset", poisoned)
+    with pytest.raises(UserError, match=r"iteration \d+: .*from the simulation is not finite"):
+        train(small_config(), tmp_path, resume=False)
+    assert (tmp_path / "not_finite.pt").is_file()
+
+
+FULL_DISK = """
+import resource
+from pathlib import Path
+from physai.errors import UserError
+from physai.training import loop
+from tests.training.small import small_config
+save = loop._save
+def limited(agent, clock, log, folder):
+    if clock.frames >= 4096:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (9_000, resource.getrlimit(resource.RLIMIT_FSIZE)[1]))
+    save(agent, clock, log, folder)
+loop._save = limited
+try:
+    loop.train(small_config(), Path("run"), resume=False)
+except UserError as error:
+    print("user error:", error)
+"""
+
+
+def test_a_full_disk_ends_the_run_in_one_line_with_the_last_good_checkpoint_kept(tmp_path, pytestconfig):
+    import subprocess
+    import sys
+
+    (tmp_path / "run").mkdir()
+    environment = os.environ | {"PYTHONPATH": str(pytestconfig.rootpath)}
+    done = subprocess.run(
+        [sys.executable, "-c", FULL_DISK], cwd=tmp_path, env=environment, capture_output=True, text=True
+    )
+    assert "user error: cannot write to run: File too large" in done.stdout, done.stderr[-2000:]
+    kept = sorted((tmp_path / "run" / "checkpoints").glob("0*.pt"))
+    assert int(kept[-1].stem) == 2048
+    assert load(kept[-1])["frames"] == 2048
