@@ -21,11 +21,13 @@ class SweepReport(Callback):
         runs = sorted((path.parent.parent for path in folder.glob("*/.hydra/overrides.yaml")), key=_number)
         summaries = {run: read_summary(run) for run in runs}
         table = Table(title=f"{folder}", title_justify="left")
-        for column in ("run", "overrides", "success", "steps", "frames", "seconds"):
-            table.add_column(column, justify="left" if column in ("run", "overrides") else "right")
+        for column in ("run", "differs by", "success", "steps", "frames", "seconds"):
+            table.add_column(column, justify="left" if column in ("run", "differs by") else "right")
+        overrides = {run: list(OmegaConf.load(run / ".hydra" / "overrides.yaml")) for run in runs}
+        common = set.intersection(*map(set, overrides.values())) if len(runs) > 1 else set()
         for run, summary in summaries.items():
-            overrides = " ".join(OmegaConf.to_container(OmegaConf.load(run / ".hydra" / "overrides.yaml")))
-            table.add_row(run.name, overrides, *_figures(run, summary))
+            differs = " ".join(override for override in overrides[run] if override not in common)
+            table.add_row(run.name, differs, *_figures(run, summary))
         Console().print(table)
         finished = [run for run, summary in summaries.items() if summary]
         if finished:

@@ -225,6 +225,7 @@ def test_the_engine_itself_holds_the_masses_inertias_and_dampings(planar, make):
     masses = dict(zip(planar.moving_links, [1.5, 0.9, 0.9], strict=True))
     dampings = {"joint1": 0.4, "joint2": 0.6}
     nominal = dict(zip(planar.moving_links, planar.link_mass, strict=True))
+    bullet.syncBodyInfo(client)  # getJointInfo answers from a cache that changeDynamics does not reach
     for index in range(bullet.getNumJoints(body, client)):
         info = bullet.getJointInfo(body, index, client)
         joint, link = info[1].decode(), info[12].decode()
@@ -260,16 +261,21 @@ def test_a_lower_velocity_gain_tracks_more_slowly(planar, make):
 def test_friction_slows_speeding_up_and_holds_a_robot_that_is_too_weak_for_it(planar, make):
     physics = make(planar, 3)
     parameters = dynamics(planar, 3, effort_limit=1.0, joint_friction=[0.0, 0.5, 1.2])
-    found = speeds(physics, parameters, 2)[-1, :, 0]
+    found = speeds(physics, parameters, 8)[-1, :, 0]
     assert found[0] > 1.5 * found[1] > 0.1
     assert found[2] == pytest.approx(0.0, abs=1e-9)
 
 
-def test_friction_helps_to_brake(planar, make):
+@pytest.mark.parametrize("target", [0.5, 0.0, -0.5], ids=["slow down", "stop", "turn back"])
+def test_friction_helps_to_brake(planar, make, target):
     physics = make(planar, 2)
-    parameters = dynamics(planar, 2, effort_limit=0.5, joint_friction=[0.0, 0.4])
-    found = np.abs(speeds(physics, parameters, 2, qd=2.0, command=0.0)[-1])
-    assert found[1, 0] < found[0, 0]
+    parameters = dynamics(planar, 2, joint_damping=0.0)
+    parameters["effort_limit"] = np.array([[100.0, 0.3]] * 2)  # a strong first joint holds still
+    parameters["joint_friction"] = np.array([[0.0, 0.0], [0.0, 0.2]])
+    reset_all(physics, np.zeros((2, 2)), np.tile([0.0, 2.0], (2, 1)), parameters)
+    frictionless, rubbing = physics.step(np.tile([0.0, target], (2, 1)))[1][:, 1]
+    assert frictionless == pytest.approx(1.6, abs=0.1)
+    assert rubbing == pytest.approx(2.0 - (2.0 - frictionless) * (0.3 + 0.2) / 0.3, abs=0.02)
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,243 @@
+import subprocess
+import sys
+import warnings
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from gymnasium.utils.env_checker import check_env
+from gymnasium.vector import AutoresetMode
+from stable_baselines3.common.env_checker import check_env as check_env_sb3
+
+import physai  # noqa: F401  (registers the ids)
+
+IDS = ["physai/Reacher-v0", "physai/KukaReacher-v0"]
+
+
+@pytest.fixture
+def make():
+    """Make an env, or a vector env, that is closed after the test."""
+    made = []
+
+    def make_env(name, num_envs=None, **options):
+        if num_envs is None:
+            made.append(gymnasium.make(name, **options))
+        else:
+            kind = "vector_entry_point"
+            made.append(gymnasium.make_vec(name, num_envs=num_envs, vectorization_mode=kind, **options))
+        return made[-1]
+
+    yield make_env
+    for env in made:
+        env.close()
+
+
+def in_fresh_python(script):
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+
+
+def goal_pixels(image):
+    red, green, blue = np.moveaxis(image.astype(int), -1, 0)
+    return (green > 60) & (green > 1.5 * red) & (green > 1.5 * blue)
+
+
+@pytest.mark.parametrize("name", IDS)
+def test_gymnasium_s_checker_passes_without_a_warning(make, name):
+    env = make(name).unwrapped
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_env(env)
+
+
+@pytest.mark.parametrize("name", IDS)
+def test_stable_baselines3_s_checker_passes_without_a_warning(make, name):
+    env = make(name)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_env_sb3(env, warn=True)
+
+
+@pytest.mark.parametrize("name", IDS)
+@pytest.mark.parametrize("direction", [[1.0, 1.0], [-1.0, -1.0], [1.0, -1.0]])
+def test_observations_stay_in_their_space_at_full_speed_to_the_end(make, name, direction):
+    env = make(name, 16, overrides=["env.task.tolerance=1e-6"])
+    env.reset(seed=0)
+    action = np.tile(np.array(direction, dtype=np.float32), (16, 1))
+    for _ in range(200):
+        observation = env.step(action)[0]
+        assert env.observation_space.contains(observation), observation
+    assert env.observation_space.shape == (16, 8)
+
+
+def test_equal_seeds_give_equal_episodes_and_others_do_not(make):
+    env = make(IDS[0])
+    seen = []
+    for seed in (3, 3, 4):
+        first = env.reset(seed=seed)[0]
+        seen.append(np.array([first, *(env.step(np.array([0.3, -0.6], np.float32))[0] for _ in range(20))]))
+    np.testing.assert_array_equal(seen[0], seen[1])
+    assert not np.isclose(seen[0][0], seen[2][0]).all()
+    assert not np.array_equal(env.reset()[0], env.reset()[0])  # episodes without a seed go on, not over again
+
+
+def test_one_env_and_the_torchrl_env_play_the_same_episode(make):
+    env = make(IDS[0])
+    batched = physai.make_env("reacher", 1, overrides=["randomization=none"])
+    env.reset(seed=0)
+    batched.reset()
+    batched.simulation.set_state(env.unwrapped.simulation.state())
+    td = batched.base_env.fake_tensordict()
+    random = np.random.default_rng(0)
+    for _ in range(50):
+        action = random.uniform(-1, 1, 2).astype(np.float32)
+        observation, reward, terminated, truncated, _ = env.step(action)
+        td = batched.step(td.set("action", torch.from_numpy(action)[None]))["next"]
+        np.testing.assert_array_equal(td["observation"][0].numpy(), observation)
+        assert (float(td["reward"]), bool(td["terminated"]), bool(td["truncated"])) == (reward, terminated, truncated)
+    batched.close()
+
+
+def test_info_tells_success_and_distance(make):
+    env = make(IDS[0])
+    observation, info = env.reset(seed=0)
+    assert info["is_success"] is False
+    assert info["distance"] == pytest.approx(np.linalg.norm(observation[4:6] - observation[6:8]), abs=1e-6)
+    env.unwrapped.simulation.goal = torch.from_numpy(observation[None, 4:6].copy())
+    _, reward, terminated, truncated, info = env.step(np.zeros(2, np.float32))
+    assert (terminated, truncated, info["is_success"]) == (True, False, True)
+    assert reward == pytest.approx(10.0 - info["distance"])
+
+
+def test_an_episode_is_truncated_after_200_steps(make):
+    env = make(IDS[0], overrides=["env.task.tolerance=1e-6"])
+    env.reset(seed=0)
+    ends = [env.step(np.zeros(2, np.float32))[2:4] for _ in range(200)]
+    assert ends == [(False, False)] * 199 + [(False, True)]
+
+
+@pytest.mark.parametrize("name", IDS)
+def test_a_vector_env_restarts_an_episode_at_the_step_after_its_end(make, name):
+    env = make(name, 4, overrides=["env.task.max_steps=5", "env.task.tolerance=1e-3"])
+    assert env.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP
+    assert env.spec is not None
+    first, info = env.reset(seed=0)
+    assert first.shape == (4, 8)
+    assert first.dtype == np.float32
+    assert env.observation_space.contains(first)
+    simulation = env.unwrapped.simulation
+    simulation.goal = simulation.goal.clone()
+    simulation.goal[1] = torch.from_numpy(first[1, 4:6].copy())  # the second robot is at its goal
+    still = np.zeros((4, 2), np.float32)
+    go = np.tile(np.array([0.5, 0.0], np.float32), (4, 1))
+    terminations, truncations, observations, rewards, infos = [], [], [], [], []
+    for step in range(1, 9):
+        observation, reward, terminated, truncated, info = env.step(still if step == 1 else go)
+        observations.append(observation)
+        rewards.append(reward)
+        terminations.append(terminated.tolist())
+        truncations.append(truncated.tolist())
+        infos.append(info)
+    no = [False] * 4
+    second, others = [False, True, False, False], [True, False, True, True]
+    assert terminations == [second, *[no] * 7]
+    # The second robot restarts in step 2 and plays 3 to 7; the others play 1 to 5 and restart in step 6.
+    assert truncations == [no, no, no, no, others, no, second, no]
+    assert rewards[0][1] > 9.9
+    assert rewards[1][1] == 0
+    assert (rewards[1][[0, 2, 3]] < 0).all()
+    assert rewards[5][[0, 2, 3]].tolist() == [0, 0, 0]
+    assert infos[0]["is_success"].tolist() == second
+    np.testing.assert_array_equal(observations[0][1, 6:], first[1, 4:6])  # the last observation of the old episode
+    assert (observations[1][1, 6:] != observations[0][1, 6:]).all()  # the first of the new one
+    assert (observations[1][1, 2:4] == 0).all()  # the action was not applied
+    assert (observations[2][1, 2] > 0.05).all()
+    np.testing.assert_array_equal(observations[4][0, 6:], first[0, 6:])
+    assert (observations[5][0, 6:] != first[0, 6:]).all()
+    for row in (0, 2, 3):
+        np.testing.assert_array_equal(observations[1][row, 6:], first[row, 6:])
+
+
+def test_arrays_of_a_vector_env_are_not_changed_by_later_steps(make):
+    env = make(IDS[0], 3, overrides=["env.task.max_steps=3"])
+    kept = [env.reset(seed=0)[0]]
+    copies = [kept[0].copy()]
+    for _ in range(10):
+        observation, reward, terminated, truncated, info = env.step(np.ones((3, 2), np.float32))
+        for value in (observation, reward, terminated, truncated, *info.values()):
+            kept.append(value)
+            copies.append(np.array(value))
+    for value, copy in zip(kept, copies, strict=True):
+        np.testing.assert_array_equal(value, copy)
+
+
+def test_a_row_of_a_vector_env_follows_its_seed(make):
+    env = make(IDS[0], 3)
+    first, again, other = (env.reset(seed=seed)[0] for seed in (1, 1, 2))
+    np.testing.assert_array_equal(first, again)
+    assert not np.isclose(first, other).all(-1).any()
+    assert len(np.unique(first[:, 0])) == 3
+
+
+@pytest.mark.parametrize("name", IDS)
+def test_the_picture_shows_the_goal_where_it_is(make, name):
+    env = make(name, render_mode="rgb_array")
+    env.reset(seed=0)
+    simulation = env.unwrapped.simulation
+    centres = []
+    for goal in ([0.4, 0.0], [0.0, 0.4], [-0.4, 0.0]):
+        simulation.goal = torch.tensor([goal])
+        image = env.render()
+        assert image.dtype == np.uint8
+        assert image.shape == (360, 480, 3)
+        rows, columns = goal_pixels(image).nonzero()
+        assert len(rows) > 50
+        centres.append((rows.mean(), columns.mean()))
+    for one in range(3):
+        for other in range(one):
+            assert np.linalg.norm(np.subtract(centres[one], centres[other])) > 30
+
+
+def test_looking_does_not_disturb_the_simulation(make):
+    seen = []
+    for mode in (None, "rgb_array"):
+        env = make(IDS[0], render_mode=mode)
+        env.reset(seed=0)
+        steps = []
+        for _ in range(5):
+            steps.append(env.step(np.ones(2, np.float32))[0])
+            env.render()
+        seen.append(steps)
+    np.testing.assert_array_equal(*seen)
+
+
+def test_a_vector_env_renders_its_first_robot(make):
+    env = make(IDS[0], 2, render_mode="rgb_array")
+    env.reset(seed=0)
+    (image,) = env.render()
+    assert goal_pixels(image).sum() > 50
+
+
+def test_importing_physai_registers_the_ids_and_imports_nothing_heavy():
+    in_fresh_python(
+        "import sys, physai, gymnasium\n"
+        f"assert set({IDS}) <= set(gymnasium.registry)\n"
+        "heavy = {'torch', 'torchrl', 'tensordict', 'pybullet', 'hydra', 'omegaconf', 'pydantic', 'rclpy', 'pandas'}\n"
+        "assert not heavy & set(sys.modules), heavy & set(sys.modules)\n"
+    )
+
+
+def test_a_gymnasium_env_needs_no_torchrl():
+    in_fresh_python(
+        "import sys, gymnasium, physai\n"
+        "env = gymnasium.make('physai/Reacher-v0'); env.reset(seed=0); env.step(env.action_space.sample())\n"
+        "envs = gymnasium.make_vec('physai/KukaReacher-v0', num_envs=2, vectorization_mode='vector_entry_point')\n"
+        "envs.reset(seed=0); envs.step(envs.action_space.sample())\n"
+        "assert not {'torchrl', 'tensordict'} & set(sys.modules)\n"
+        "env.close(); envs.close()\n"
+    )
+
+
+def test_gymnasium_finds_the_env_by_the_module_in_its_name():
+    in_fresh_python("import gymnasium; gymnasium.make('physai:physai/Reacher-v0').close()")

@@ -1,0 +1,174 @@
+import math
+
+import numpy as np
+import pytest
+import torch
+from scipy import stats
+
+from physai.envs.simulation import Simulation
+from physai.errors import UserError
+from physai.robots import ForwardKinematics, RobotSpec
+from physai.tasks import Reach
+
+
+@pytest.fixture
+def task():
+    return Reach([0.3, 0.53], tolerance=0.05, success_reward=10.0, max_steps=200, start_spread=[3.1, 2.5])
+
+
+@pytest.fixture
+def simulate(env_config):
+    """Make a simulation that is closed after the test."""
+    made = []
+
+    def make(*overrides: str, name: str = "reacher", robots: int = 4) -> Simulation:
+        made.append(Simulation(env_config(name, *overrides), robots, seed=0))
+        made[-1].reset()
+        return made[-1]
+
+    yield make
+    for simulation in made:
+        simulation.close()
+
+
+def put_goal_at_the_tip(simulation, row):
+    simulation.goal = simulation.goal.clone()
+    simulation.goal[row] = simulation.kinematics(simulation.joint_position)[row, :2]
+
+
+def test_goals_lie_in_the_ring_at_a_uniform_angle_and_radius(task):
+    goals = task.sample_goal(5000, torch.Generator().manual_seed(0)).double().numpy()
+    radius = np.linalg.norm(goals, axis=1)
+    angle = np.arctan2(goals[:, 1], goals[:, 0]) % (2 * np.pi)
+    assert radius.min() >= 0.3 - 1e-6
+    assert radius.max() <= 0.53 + 1e-6
+    assert stats.kstest(angle, stats.uniform(0, 2 * np.pi).cdf).pvalue > 0.01
+    assert stats.kstest(radius, stats.uniform(0.3, 0.23).cdf).pvalue > 0.01
+    assert abs(stats.spearmanr(angle, radius).statistic) < 0.05
+
+
+def test_the_kuka_s_goals_lie_between_30_and_60_cm(simulate):
+    simulation = simulate(name="kuka_reacher", robots=1)
+    radius = simulation.task.sample_goal(1000, torch.Generator().manual_seed(0)).norm(dim=-1)
+    assert 0.3 - 1e-6 <= radius.min() < 0.31
+    assert 0.59 < radius.max() <= 0.6 + 1e-6
+
+
+def test_goals_and_starts_follow_the_generator(task, reacher):
+    spec = RobotSpec.from_config(reacher.robot)
+    for sample in (task.sample_goal, lambda rows, generator: task.sample_start(rows, spec, generator)):
+        first, again, other = (sample(16, torch.Generator().manual_seed(seed)) for seed in (1, 1, 2))
+        assert torch.equal(first, again)
+        assert not torch.isclose(first, other).any()
+
+
+def test_starts_are_uniform_around_home_and_stay_within_the_joint_limits(any_env):
+    spec = RobotSpec.from_config(any_env.robot)
+    spread = any_env.task["start_spread"]
+    task = Reach([0.3, 0.5], 0.05, 10.0, 200, spread)
+    starts = task.sample_start(4000, spec, torch.Generator().manual_seed(0)).numpy()
+    for joint, width in enumerate(spread):
+        expected = stats.uniform(spec.home[joint] - width, 2 * width)
+        assert stats.kstest(starts[:, joint], expected.cdf).pvalue > 0.01
+    wide = Reach([0.3, 0.5], 0.05, 10.0, 200, [100.0, 100.0])
+    starts = wide.sample_start(100, spec, torch.Generator().manual_seed(0)).numpy()
+    assert (starts >= spec.position_limit[:, 0]).all()
+    assert (starts <= spec.position_limit[:, 1]).all()
+
+
+def test_distance_counts_in_the_plane_only(task):
+    end_effector = torch.tensor([[0.3, 0.4, 9.0], [0.0, 0.0, -1.0]])
+    goal = torch.tensor([[0.0, 0.0], [-0.6, 0.8]])
+    torch.testing.assert_close(task.distance(end_effector, goal), torch.tensor([[0.5], [1.0]]))
+
+
+def test_reward_and_success_are_the_numbers_of_the_contract(task):
+    distance = torch.tensor([[0.0], [0.03], [0.0499], [0.05], [0.2], [1.08]])
+    success = task.success(distance)
+    assert success[:, 0].tolist() == [True, True, True, False, False, False]
+    expected = torch.tensor([[10.0], [9.97], [9.9501], [-0.05], [-0.2], [-1.08]])
+    torch.testing.assert_close(task.reward(distance, success), expected)
+
+
+def test_the_observation_is_positions_velocities_tip_and_goal(reacher):
+    kinematics = ForwardKinematics(RobotSpec.from_config(reacher.robot))
+    module = Reach([0.3, 0.53], 0.05, 10.0, 200, [3.1, 2.5]).observation(kinematics)
+    q, qd, goal = torch.tensor([[0.0, math.pi / 2]]), torch.tensor([[0.5, -1.0]]), torch.tensor([[0.1, 0.2]])
+    observation, features = module(q, qd, goal)
+    expected = torch.tensor([[0.0, math.pi / 2, 0.5, -1.0, 0.30, 0.25, 0.1, 0.2]])
+    torch.testing.assert_close(observation, expected)
+    assert features.shape == (1, 12)
+
+
+def test_the_scripted_observation_equals_eager_bit_for_bit(any_env):
+    spec = RobotSpec.from_config(any_env.robot)
+    module = Reach([0.3, 0.5], 0.05, 10.0, 200, [1.0, 1.0]).observation(ForwardKinematics(spec))
+    scripted = torch.jit.script(module)
+    generator = torch.Generator().manual_seed(0)
+    for _ in range(4):
+        sensed = [torch.randn(5, 2, generator=generator) for _ in range(3)]
+        for ours, theirs in zip(module(*sensed), scripted(*sensed), strict=True):
+            assert torch.equal(ours, theirs)
+
+
+def test_the_step_that_reaches_the_goal_and_runs_out_of_time_only_terminates(simulate):
+    simulation = simulate("env.task.max_steps=1")
+    simulation.goal = torch.full((4, 2), 9.0)
+    put_goal_at_the_tip(simulation, 2)
+    reward, terminated, truncated = simulation.step(torch.zeros(4, 2))
+    assert terminated[:, 0].tolist() == [False, False, True, False]
+    assert truncated[:, 0].tolist() == [True, True, False, True]
+    assert reward[2] > 9.9
+    assert (reward[[0, 1, 3]] < -1).all()
+
+
+def test_episodes_that_miss_the_goal_are_truncated_after_exactly_200_steps(simulate):
+    simulation = simulate()
+    simulation.goal = torch.full((4, 2), 9.0)
+    late = torch.tensor([False, True, False, False])
+    for step in range(1, 241):
+        _, terminated, truncated = simulation.step(torch.zeros(4, 2))
+        assert not terminated.any()
+        expected = [step >= 200, step >= 240, step >= 200, step >= 200]
+        assert truncated[:, 0].tolist() == expected
+        if step == 40:
+            simulation.reset(late)
+            simulation.goal = torch.full((4, 2), 9.0)
+    assert simulation.episode_length[:, 0].tolist() == [240, 200, 240, 240]
+
+
+def test_return_and_length_sum_up_since_the_row_s_own_reset(simulate):
+    simulation = simulate()
+    rewards = []
+    for step in range(10):
+        rewards.append(simulation.step(torch.ones(4, 2))[0])
+        if step == 5:
+            simulation.reset(torch.tensor([True, False, False, False]))
+    sums = torch.stack([sum(rewards[6:])[0], *sum(rewards)[1:]])
+    torch.testing.assert_close(simulation.episode_return, sums)
+    assert simulation.episode_length[:, 0].tolist() == [4, 10, 10, 10]
+
+
+def test_an_action_is_a_share_of_the_greatest_velocity_and_is_clamped(simulate):
+    simulation = simulate("env.task.start_spread=[0,0]")
+    action = torch.tensor([[0.5, 0.0], [1.0, 0.0], [3.0, 0.0], [-7.0, 0.0]])
+    for _ in range(30):
+        simulation.step(action)
+    expected = torch.tensor([1.0, 2.0, 2.0, -2.0])
+    torch.testing.assert_close(simulation.joint_velocity[:, 0], expected, rtol=0, atol=0.02)
+
+
+@pytest.mark.parametrize(
+    ("override", "words"),
+    [
+        ("env.task.goal_radius=[0.5,0.3]", ["env.task.goal_radius", "0.5", "0.3"]),
+        ("env.task.goal_radius=[0.3,0.9]", ["env.task.goal_radius", "0.9", "reach", "planar_arm"]),
+        ("env.task.start_spread=[1.0]", ["env.task.start_spread", "2 joints"]),
+        ("env.max_velocity=3.0", ["env.max_velocity", "3.0", "2.5"]),
+    ],
+)
+def test_a_task_that_the_robot_cannot_do_is_refused(env_config, override, words):
+    with pytest.raises(UserError) as caught:
+        Simulation(env_config("reacher", override), 1, seed=0)
+    for word in words:
+        assert word in str(caught.value)

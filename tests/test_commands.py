@@ -1,0 +1,229 @@
+"""The commands as a user types them: what they refuse, and in which words."""
+
+import json
+import os
+import runpy
+import shutil
+import sys
+from pathlib import Path
+
+import pytest
+from hydra.core.global_hydra import GlobalHydra
+
+from tests.training.small import SMALL, command
+
+ROOT = Path(__file__).parent.parent
+
+
+@pytest.fixture
+def run(tmp_path, monkeypatch, capsys):
+    """Run a command in this process, in an empty folder; return exit code, standard output and error."""
+
+    def run(module, *arguments):
+        monkeypatch.chdir(tmp_path)
+        monkeypatch.setattr(sys, "argv", [f"physai.{module}", *arguments])
+        monkeypatch.setenv("COLUMNS", "200")
+        GlobalHydra.instance().clear()
+        try:
+            runpy.run_module(f"physai.{module}", run_name="__main__")
+            code = 0
+        except SystemExit as stop:
+            code = stop.code or 0
+        return code, *capsys.readouterr()
+
+    return run
+
+
+def broken_urdf(tmp_path, old, new):
+    text = (ROOT / "physai" / "robots" / "assets" / "planar_arm.urdf").read_text()
+    assert old in text
+    path = tmp_path.parent / f"{tmp_path.name}.urdf"
+    path.write_text(text.replace(old, new, 1))
+    return path
+
+
+BAD_TRAINING = {
+    "misspelt key": (["total_frame=5"], "unknown key 'total_frame'; did you mean 'total_frames'?"),
+    "misspelt key with +": (["+total_frame=5"], "unknown key 'total_frame'; did you mean 'total_frames'?"),
+    "misspelt nested key": (["algo.optimizer.lrr=5"], "unknown key 'algo.optimizer.lrr'; did you mean 'algo.optimizer.lr'?"),
+    "misspelt argument with +": (["+algo.loss.clip_epsilonn=1"], "clip_epsilonn' of torchrl.objectives.ClipPPOLoss; did you mean"),
+    "key at the wrong place": (["+clip_epsilon=0.1"], "did you mean 'algo.loss.clip_epsilon'?"),
+    "misspelt group": (["envs=reacher"], "unknown key 'envs'; did you mean 'env'?"),
+    "unknown env": (["env=reachr"], "env/reachr: no such config; did you mean 'reacher'?"),
+    "unknown target": (["algo.optimizer._target_=torch.optim.Adamm"], "torch.optim has no 'Adamm'; did you mean 'Adam'?"),
+    "wrong type": (["algo.optimizer.lr=fast"], "algo.optimizer.lr: input should be a valid number"),
+    "wrong type of a count": (["total_frames=many"], "total_frames: input should be a valid integer"),
+    "text for a number": (["env.control_dt='0.02'"], "env.control_dt: input should be a valid number"),
+    "negative size": (["policy.actor.hidden_sizes=[-3]"], "policy.actor.hidden_sizes: input should be greater than 0"),
+    "zero robots": (["collector.num_envs=0"], "collector.num_envs: input should be greater than 0, got 0"),
+    "negative seed": (["seed=-1"], "seed: input should be greater than or equal to 0, got -1"),
+    "zero batch": (["collector.frames_per_batch=0"], "collector.frames_per_batch: input should be greater than 0"),
+    "uneven batch": (["collector.frames_per_batch=2000"], "must be a multiple of collector.num_envs (128)"),
+    "minibatch too large": (["algo.buffer.batch_size=5000"], "a minibatch of 5000 is larger than a batch"),
+    "negative rate": (["algo.optimizer.lr=-1"], "Invalid learning rate: -1"),
+    "unknown input": (["policy.actor.in_keys=[observatio]"], "the env gives no 'observatio'; did you mean 'observation'?"),
+    "unreachable goals": (["env.task.goal_radius=[0.3,0.9]"], "0.9 m is beyond the reach of 'planar_arm', 0.550 m"),
+    "too fast": (["env.max_velocity=9"], "beyond the limit of 'planar_arm', 2.5 rad/s"),
+    "reversed range": (["randomization.payload.low=3"], "randomization.payload"),
+    "missing URDF": (["env.robot.urdf=/nowhere.urdf"], "/nowhere.urdf: no such URDF file"),
+    "unknown joint": (["env.robot.joints=[joint1,joint3]"], "no joint 'joint3'; did you mean"),
+    "not an override": (["total_frames"], "not an override such as key=value"),
+    "unwritable folder": (["hydra.run.dir=/proc/nowhere/run"], "cannot create the run folder /proc/nowhere/run"),
+    "resume of nothing": (["resume=nowhere"], "nowhere: no run there"),
+    "bad value in a sweep": (["-m", "seed=0,1", "algo.optimizer.lr=1e-3,-1"], "Invalid learning rate: -1"),
+}
+
+
+@pytest.mark.parametrize("case", BAD_TRAINING)
+def test_train_refuses_in_one_line_before_anything_exists(run, tmp_path, case):
+    arguments, message = BAD_TRAINING[case]
+    code, _, error = run("train", *arguments)
+    assert code == 2
+    assert message in error
+    assert len(error.strip().splitlines()) == 1, error
+    assert error.startswith("error: ")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ('<mass value="1.0"/>', '<mass value="heavy"/>', "link 'link1': <mass value> is 'heavy'"),
+        ('<mass value="0.6"/>', '<mass value="-1"/>', "link 'link2': its mass is negative"),
+        ('<child link="link2"/>', '<child link="lnik2"/>', "joint 'joint2': its child link 'lnik2' does not exist"),
+        ("</robot>", "", "not well-formed XML"),
+    ],
+)
+def test_a_broken_urdf_names_the_part_that_is_broken(run, tmp_path, old, new, message):
+    path = broken_urdf(tmp_path, old, new)
+    code, _, error = run("train", f"env.robot.urdf={path}")
+    assert code == 2
+    assert message in error
+    assert len(error.strip().splitlines()) == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("commands")
+    process = command("train", *SMALL, "hydra.run.dir=run", cwd=folder)
+    output = process.communicate()[0]
+    assert process.returncode == 0, output
+    return folder / "run"
+
+
+@pytest.fixture
+def copied(finished, tmp_path):
+    shutil.copytree(finished, tmp_path / "run")
+    return tmp_path / "run"
+
+
+def test_resume_refuses_another_config_and_names_the_difference(run, copied):
+    code, _, error = run("train", "resume=run", "algo.advantage.gamma=0.5")
+    assert code == 2
+    assert "the run has algo.advantage.gamma=0.95, not 0.5; a resumed run keeps its config" in error
+    code, output, _ = run("train", "resume=run", "algo.advantage.gamma=0.95")
+    assert code == 0
+    assert "complete already" in output
+
+
+def test_resume_refuses_a_truncated_checkpoint(run, copied):
+    (copied / "summary.json").unlink()
+    last = sorted((copied / "checkpoints").glob("0*.pt"))[-1]
+    last.write_bytes(last.read_bytes()[:1000])
+    code, _, error = run("train", "resume=run")
+    assert code == 2
+    assert f"{last.name}: the checkpoint is damaged" in error
+
+
+def test_resume_refuses_a_truncated_config(run, copied):
+    config = copied / ".hydra" / "config.yaml"
+    config.write_text(config.read_text()[:300])
+    code, _, error = run("train", "resume=run")
+    assert code == 2
+    assert "the run's config is damaged" in error
+    assert len(error.strip().splitlines()) == 1
+
+
+def test_a_second_run_does_not_overwrite_the_first(run, copied):
+    before = (copied / "summary.json").read_bytes()
+    code, _, error = run("train", *SMALL, "hydra.run.dir=run")
+    assert code == 2
+    assert "holds a run already: go on with resume=run" in error
+    assert (copied / "summary.json").read_bytes() == before
+
+
+def test_evaluate_says_how_sure_it_is_and_which_randomization_it_used(run, copied):
+    code, output, _ = run("evaluate", "run=run", "episodes=50", "randomization=strong")
+    assert code == 0
+    assert "95 % interval" in output
+    assert "strong" in output
+    result = json.loads((copied / "evaluation_strong.json").read_text())
+    assert result["episodes"] == 50
+    assert result["success_ci"][0] <= result["success_rate"] <= result["success_ci"][1]
+
+
+@pytest.mark.parametrize(
+    ("module", "arguments", "message"),
+    [
+        ("evaluate", ["run=nowhere"], "nowhere: no run there"),
+        ("evaluate", ["run=run", "checkpoint=7"], "no checkpoint '7'; there are: best"),
+        ("evaluate", ["run=run", "episodes=0"], "episodes: input should be greater than 0"),
+        ("evaluate", ["run=run", "randomization=stron"], "did you mean 'strong'?"),
+        ("evaluate", [], "run"),
+        ("play", ["run=run", "output=arm.avi"], "must end in .mp4 or .gif"),
+        ("play", ["run=run", "render=windw"], "render: input should be 'video' or 'human'"),
+        ("plot", ["runs=[nowhere]"], "nowhere: no run there"),
+        ("plot", ["runs=[]"], "runs: list should have at least 1 item"),
+    ],
+)
+def test_the_other_commands_refuse_in_one_line_too(run, copied, module, arguments, message):
+    code, _, error = run(module, *arguments)
+    assert code == 2
+    assert message in error
+    assert len(error.strip().splitlines()) == 1, error
+
+
+@pytest.mark.parametrize(("name", "magic"), [("arm.gif", b"GIF89a"), ("arm.mp4", b"ftyp")])
+def test_play_writes_a_video(run, copied, tmp_path, name, magic):
+    code, output, _ = run("play", "run=run", f"output={name}", "goals=1")
+    assert code == 0
+    assert magic in (tmp_path / name).read_bytes()[:16]
+    assert f"Video: {name}" in output
+
+
+@pytest.mark.skipif(bool(os.environ.get("DISPLAY")), reason="there is a screen here")
+def test_play_in_a_window_without_a_screen_says_so(run, copied):
+    code, _, error = run("play", "run=run", "render=human")
+    assert code == 2
+    assert "there is no screen here" in error
+
+
+def test_plot_overlays_runs(run, copied, tmp_path):
+    shutil.copytree(copied, tmp_path / "again")
+    code, _, _ = run("plot", "runs=[run,again]", "output=both.png")
+    assert code == 0
+    assert (tmp_path / "both.png").read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize("module", ["train", "evaluate", "play", "plot"])
+def test_help_shows_examples_and_every_value(run, module):
+    code, output, _ = run(module, "--help")
+    assert code == 0
+    assert f"python -m physai.{module}" in output
+    assert "== Values" in output
+
+
+@pytest.mark.slow
+def test_a_sweep_ends_with_a_table_of_all_runs_and_a_failure_stands_out(tmp_path):
+    # a rate of 5e38 passes every check and explodes at the first update
+    arguments = ["-m", *SMALL, "algo.optimizer.lr=1e-3,5e38", "hydra.sweep.dir=sweep"]
+    process = command("train", *arguments, cwd=tmp_path)
+    output = process.communicate()[0]
+    assert process.returncode == 1
+    table = output[output.rindex("differs by") :]
+    assert "algo.optimizer.lr=1e-3" in table
+    assert "failed: iteration 1" in table
+    assert "error: 1 of 2 runs failed: sweep/1" in table
+    assert (tmp_path / "sweep" / "training.png").is_file()
+    assert (tmp_path / "sweep" / "0" / "summary.json").is_file()
