@@ -27,15 +27,17 @@ class SweepReport(Callback):
         common = set.intersection(*map(set, overrides.values())) if len(runs) > 1 else set()
         for run, summary in summaries.items():
             differs = " ".join(override for override in overrides[run] if override not in common)
-            table.add_row(run.name, differs, *_figures(run, summary))
+            table.add_row(run.name, differs, *_figures(summary))
         Console().print(table)
         finished = [run for run, summary in summaries.items() if summary]
         if finished:
             plot_runs(finished, folder / "training.png")
             print(f"Curves of all runs: {folder / 'training.png'}")
         failed = [run for run in runs if run not in finished]
+        for run in failed:
+            print(f"error: {run}: {_reason(run)}", file=sys.stderr)
         if failed:
-            print(f"error: {len(failed)} of {len(runs)} runs failed: {', '.join(map(str, failed))}", file=sys.stderr)
+            print(f"error: {len(failed)} of {len(runs)} runs failed", file=sys.stderr)
             sys.exit(1)
 
 
@@ -43,11 +45,14 @@ def _number(run: Path) -> tuple[int, str]:
     return (int(run.name) if run.name.isdigit() else 0, run.name)
 
 
-def _figures(run: Path, summary: dict[str, Any] | None) -> list[str]:
+def _reason(run: Path) -> str:
+    error = run / "error.txt"
+    return error.read_text().splitlines()[0] if error.is_file() else "it did not finish"
+
+
+def _figures(summary: dict[str, Any] | None) -> list[str]:
     if summary is None:
-        error = run / "error.txt"
-        reason = error.read_text().splitlines()[0] if error.is_file() else "no summary.json"
-        return [f"[red]failed: {reason}[/red]", "", "", ""]
+        return ["[red]failed[/red]", "", "", ""]
     steps = summary["steps_to_goal"]
     return [
         f"{summary['success_rate']:.1%}",

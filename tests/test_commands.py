@@ -222,8 +222,9 @@ def test_a_sweep_ends_with_a_table_of_all_runs_and_a_failure_stands_out(tmp_path
     output = process.communicate()[0]
     assert process.returncode == 1
     table = output[output.rindex("differs by") :]
-    assert "algo.optimizer.lr=1e-3" in table
-    assert "failed: iteration 1" in table
-    assert "error: 1 of 2 runs failed: sweep/1" in table
+    assert "algo.optimizer.lr=0.001" in table
+    assert "failed" in table
+    assert "error: sweep/1: iteration 1: the loss is not finite" in table
+    assert "error: 1 of 2 runs failed" in table
     assert (tmp_path / "sweep" / "training.png").is_file()
     assert (tmp_path / "sweep" / "0" / "summary.json").is_file()
