@@ -121,9 +121,7 @@ def median_speeds(*sides: Callable[[], int], rounds: int) -> list[float]:
     for side in sides:
         side()
     results = [[timed(side) for side in sides] for _ in range(rounds)]
-    return [
-        statistics.median(done / seconds for done, seconds in side) for side in zip(*results, strict=True)
-    ]
+    return [statistics.median(done / seconds for done, seconds in side) for side in zip(*results, strict=True)]
 
 
 @contextmanager

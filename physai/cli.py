@@ -85,7 +85,7 @@ def _combinations(given: list[str]) -> Iterator[list[str]]:
             key = override.get_key_element()
             choices.append([f"{key}={value}" for value in override.sweep_string_iterator()])
         elif not override.is_sweep_override():
-            choices.append([override.input_line])
+            choices.append([str(override.input_line)])
     return (list(one) for one in itertools.product(*choices))
 
 

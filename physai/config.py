@@ -1,4 +1,4 @@
-"""Composing and checking configuration: values live in ``conf/``, types and ranges in the models that inherit Config."""
+"""Composing and checking configuration: values live in ``conf/``, types and ranges in models that inherit Config."""
 
 import difflib
 import importlib
@@ -154,7 +154,9 @@ def _check_target(node: dict[str, Any], path: str = "") -> dict[str, Any]:
         if key in ("_target_", "_partial_"):
             continue
         if key not in hints and not is_open:
-            raise ValueError(f": unknown key '{path.lstrip('.')}{'.' if path else ''}{key}' of {name}{nearest(key, hints)}")
+            raise ValueError(
+                f": unknown key '{path.lstrip('.')}{'.' if path else ''}{key}' of {name}{nearest(key, hints)}"
+            )
         if isinstance(value, Mapping) and "_target_" in value:
             _check_target(dict(value), f"{path}.{key}")
         else:
@@ -175,16 +177,20 @@ def _import(name: str, path: str) -> Any:
             for part in attribute.split("."):
                 found = getattr(found, part)
         except AttributeError:
-            raise ValueError(f"{path}._target_: {module} has no '{attribute}'{nearest(attribute, dir(found))}") from None
+            raise ValueError(
+                f"{path}._target_: {module} has no '{attribute}'{nearest(attribute, dir(found))}"
+            ) from None
         return found
     raise ValueError(f"{path}._target_: there is no '{name}'")
 
 
 def _parameters(target: Any) -> tuple[dict[str, Any], bool]:
     """Names and types of the keyword arguments, those that ``**kwargs`` hands on to base classes included."""
-    functions = [vars(base)["__init__"] for base in target.__mro__ if "__init__" in vars(base)] if inspect.isclass(
-        target
-    ) else [target]
+    functions = (
+        [vars(base)["__init__"] for base in target.__mro__ if "__init__" in vars(base)]
+        if inspect.isclass(target)
+        else [target]
+    )
     hints: dict[str, Any] = {}
     for function in functions:
         parameters = inspect.signature(function).parameters.values()
@@ -193,7 +199,10 @@ def _parameters(target: Any) -> tuple[dict[str, Any], bool]:
         except (NameError, TypeError):
             types = {}
         for parameter in parameters:
-            if parameter.name != "self" and parameter.kind not in (parameter.VAR_KEYWORD, parameter.VAR_POSITIONAL):
+            if parameter.name != "self" and parameter.kind not in (
+                parameter.VAR_KEYWORD,
+                parameter.VAR_POSITIONAL,
+            ):
                 hints.setdefault(parameter.name, types.get(parameter.name, Any))
         if not any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters):
             return hints, False

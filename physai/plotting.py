@@ -12,7 +12,7 @@ from omegaconf import OmegaConf
 from physai.errors import UserError
 
 matplotlib.use("Agg")
-import matplotlib.pyplot as plt  # noqa: E402
+import matplotlib.pyplot as plt
 
 _BINS = 60
 
@@ -20,8 +20,8 @@ _BINS = 60
 def plot_runs(runs: Sequence[Path], output: Path) -> None:
     """Draw episode return (left) and length (right) over frames, smoothed, with their spread.
 
-    One run shows the mean of its episodes and the band of their 10th to 90th percentile. Runs that differ only in their seed
-    become one curve: the mean over runs, in the band from the lowest to the highest of them.
+    One run shows the mean of its episodes and the band of their 10th to 90th percentile. Runs that differ only in
+    their seed become one curve: the mean over runs, in the band from the lowest to the highest of them.
 
     Args:
         runs: Run folders.
@@ -34,7 +34,9 @@ def plot_runs(runs: Sequence[Path], output: Path) -> None:
     for run in runs:
         groups.setdefault(_label(run), []).append(_episodes(run))
     figure, axes = plt.subplots(1, 2, figsize=(11, 4.2), layout="constrained")
-    for axis, column, title in zip(axes, ("return", "length"), ("Episode return", "Episode length (steps)"), strict=True):
+    for axis, column, title in zip(
+        axes, ("return", "length"), ("Episode return", "Episode length (steps)"), strict=True
+    ):
         for label, members in groups.items():
             _curve(axis, members, column, label)
         axis.set_title(title)

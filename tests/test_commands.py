@@ -45,30 +45,54 @@ def broken_urdf(tmp_path, old, new):
 BAD_TRAINING = {
     "misspelt key": (["total_frame=5"], "unknown key 'total_frame'; did you mean 'total_frames'?"),
     "misspelt key with +": (["+total_frame=5"], "unknown key 'total_frame'; did you mean 'total_frames'?"),
-    "misspelt nested key": (["algo.optimizer.lrr=5"], "unknown key 'algo.optimizer.lrr'; did you mean 'algo.optimizer.lr'?"),
-    "misspelt argument with +": (["+algo.loss.clip_epsilonn=1"], "clip_epsilonn' of torchrl.objectives.ClipPPOLoss; did you mean"),
+    "misspelt nested key": (
+        ["algo.optimizer.lrr=5"],
+        "unknown key 'algo.optimizer.lrr'; did you mean 'algo.optimizer.lr'?",
+    ),
+    "misspelt argument with +": (
+        ["+algo.loss.clip_epsilonn=1"],
+        "clip_epsilonn' of torchrl.objectives.ClipPPOLoss; did you mean",
+    ),
     "key at the wrong place": (["+clip_epsilon=0.1"], "did you mean 'algo.loss.clip_epsilon'?"),
     "misspelt group": (["envs=reacher"], "unknown key 'envs'; did you mean 'env'?"),
     "unknown env": (["env=reachr"], "env/reachr: no such config; did you mean 'reacher'?"),
-    "unknown target": (["algo.optimizer._target_=torch.optim.Adamm"], "torch.optim has no 'Adamm'; did you mean 'Adam'?"),
+    "unknown target": (
+        ["algo.optimizer._target_=torch.optim.Adamm"],
+        "torch.optim has no 'Adamm'; did you mean 'Adam'?",
+    ),
     "wrong type": (["algo.optimizer.lr=fast"], "algo.optimizer.lr: input should be a valid number"),
     "wrong type of a count": (["total_frames=many"], "total_frames: input should be a valid integer"),
     "text for a number": (["env.control_dt='0.02'"], "env.control_dt: input should be a valid number"),
-    "negative size": (["policy.actor.hidden_sizes=[-3]"], "policy.actor.hidden_sizes: input should be greater than 0"),
+    "negative size": (
+        ["policy.actor.hidden_sizes=[-3]"],
+        "policy.actor.hidden_sizes: input should be greater than 0",
+    ),
     "zero robots": (["collector.num_envs=0"], "collector.num_envs: input should be greater than 0, got 0"),
     "negative seed": (["seed=-1"], "seed: input should be greater than or equal to 0, got -1"),
-    "zero batch": (["collector.frames_per_batch=0"], "collector.frames_per_batch: input should be greater than 0"),
+    "zero batch": (
+        ["collector.frames_per_batch=0"],
+        "collector.frames_per_batch: input should be greater than 0",
+    ),
     "uneven batch": (["collector.frames_per_batch=2000"], "must be a multiple of collector.num_envs (128)"),
     "minibatch too large": (["algo.buffer.batch_size=5000"], "a minibatch of 5000 is larger than a batch"),
     "negative rate": (["algo.optimizer.lr=-1"], "Invalid learning rate: -1"),
-    "unknown input": (["policy.actor.in_keys=[observatio]"], "the env gives no 'observatio'; did you mean 'observation'?"),
-    "unreachable goals": (["env.task.goal_radius=[0.3,0.9]"], "0.9 m is beyond the reach of 'planar_arm', 0.550 m"),
+    "unknown input": (
+        ["policy.actor.in_keys=[observatio]"],
+        "the env gives no 'observatio'; did you mean 'observation'?",
+    ),
+    "unreachable goals": (
+        ["env.task.goal_radius=[0.3,0.9]"],
+        "0.9 m is beyond the reach of 'planar_arm', 0.550 m",
+    ),
     "too fast": (["env.max_velocity=9"], "beyond the limit of 'planar_arm', 2.5 rad/s"),
     "reversed range": (["randomization.payload.low=3"], "randomization.payload"),
     "missing URDF": (["env.robot.urdf=/nowhere.urdf"], "/nowhere.urdf: no such URDF file"),
     "unknown joint": (["env.robot.joints=[joint1,joint3]"], "no joint 'joint3'; did you mean"),
     "not an override": (["total_frames"], "not an override such as key=value"),
-    "unwritable folder": (["hydra.run.dir=/proc/nowhere/run"], "cannot create the run folder /proc/nowhere/run"),
+    "unwritable folder": (
+        ["hydra.run.dir=/proc/nowhere/run"],
+        "cannot create the run folder /proc/nowhere/run",
+    ),
     "resume of nothing": (["resume=nowhere"], "nowhere: no run there"),
     "bad value in a sweep": (["-m", "seed=0,1", "algo.optimizer.lr=1e-3,-1"], "Invalid learning rate: -1"),
 }
@@ -90,7 +114,11 @@ def test_train_refuses_in_one_line_before_anything_exists(run, tmp_path, case):
     [
         ('<mass value="1.0"/>', '<mass value="heavy"/>', "link 'link1': <mass value> is 'heavy'"),
         ('<mass value="0.6"/>', '<mass value="-1"/>', "link 'link2': its mass is negative"),
-        ('<child link="link2"/>', '<child link="lnik2"/>', "joint 'joint2': its child link 'lnik2' does not exist"),
+        (
+            '<child link="link2"/>',
+            '<child link="lnik2"/>',
+            "joint 'joint2': its child link 'lnik2' does not exist",
+        ),
         ("</robot>", "", "not well-formed XML"),
     ],
 )

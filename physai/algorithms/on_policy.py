@@ -32,7 +32,8 @@ class OnPolicy:
         actor: The policy; its ``dist_sample_keys`` and ``log_prob_keys`` tell the loss what was sampled.
         critic: The value network.
         frames_per_batch: Size of the batches to come.
-        loss: Makes the loss module from ``actor_network`` and ``critic_network``; all its ``loss_*`` outputs are summed.
+        loss: Makes the loss module from ``actor_network`` and ``critic_network``; all its ``loss_*`` outputs are
+            summed.
         advantage: Makes the advantage module from ``value_network``.
         buffer: Replay buffer that hands out minibatches; one pass through it is an epoch.
         optimizer: Makes the optimizer from the parameters.
@@ -90,7 +91,7 @@ class OnPolicy:
                     raise NonFiniteError("the loss" if not torch.isfinite(total) else "the gradient", minibatch)
                 self.optimizer.step()
                 minibatches += 1
-                for key, value in (*losses.detach().items(), ("grad_norm", norm)):
+                for key, value in {**losses.detach(), "grad_norm": norm}.items():
                     sums[key] = sums[key] + value if key in sums else value
         metrics = {key: float(value) / minibatches for key, value in sums.items()}
         metrics["lr"] = self.optimizer.param_groups[0]["lr"]

@@ -21,15 +21,13 @@ class CollectorConfig(Config):
 class RobotCollector(Collector):
     """TorchRL's collector, with a state that continues bit for bit.
 
-    Batches are [N, T]. The first observation of a batch was made at the end of the last one: it is normalized again, so that
-    one set of statistics holds for the whole batch.
+    Batches are [N, T]. The first observation of a batch was made at the end of the last one: it is normalized again,
+    so that one set of statistics holds for the whole batch.
     """
 
     def rollout(self) -> TensorDictBase:
         """Collect one batch."""
-        self._carrier.set(
-            "normalized_observation", self.env.normalization.normalize(self._carrier.get("observation"))
-        )
+        self._carrier.set("normalized_observation", self.env.normalization.normalize(self._carrier.get("observation")))
         return super().rollout()
 
     def state(self) -> dict[str, Any]:

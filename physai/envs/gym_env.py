@@ -90,7 +90,7 @@ class RobotGymEnv(gymnasium.Env[Array, Array]):
             self._viewer = self.simulation.viewer(window=self.render_mode == "human")
         return self._viewer.show(self.simulation.joint_position[0].numpy(), self.simulation.goal[0].numpy())
 
-    def render(self) -> Array | None:  # type: ignore[override]
+    def render(self) -> Array | None:
         """Return an image [height, width, 3] uint8 in the mode ``rgb_array``."""
         return self._picture() if self.render_mode == "rgb_array" else None
 
@@ -132,9 +132,7 @@ class RobotVectorEnv(VectorEnv[Array, Array, Array]):
         self._viewer: Viewer | None = None
         self._seeded = False
 
-    def reset(  # type: ignore[override]
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Array, dict[str, Any]]:
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Array, dict[str, Any]]:
         """Start an episode in every row."""
         super().reset(seed=seed)
         if seed is not None or not self._seeded:
@@ -150,11 +148,13 @@ class RobotVectorEnv(VectorEnv[Array, Array, Array]):
         reward, terminated, truncated = self.simulation.step(torch.as_tensor(actions, dtype=torch.float32))
         if fresh.any():
             self.simulation.reset(fresh)
-            reward, terminated, truncated = (value.masked_fill(fresh[:, None], 0) for value in (reward, terminated, truncated))
+            reward, terminated, truncated = (
+                value.masked_fill(fresh[:, None], 0) for value in (reward, terminated, truncated)
+            )
         self._over = (terminated | truncated)[:, 0]
         info = {"is_success": terminated[:, 0].numpy(), "distance": self.simulation.distance[:, 0].numpy()}
-        rows = (value[:, 0].numpy() for value in (reward, terminated, truncated))
-        return _observe(self.simulation), *rows, info
+        reward, terminated, truncated = reward[:, 0], terminated[:, 0], truncated[:, 0]
+        return _observe(self.simulation), reward.numpy(), terminated.numpy(), truncated.numpy(), info
 
     def render(self) -> tuple[Array, ...] | None:
         """Return an image of the first robot."""

@@ -11,9 +11,9 @@ from physai.envs.simulation import EnvConfig, Simulation
 class RobotEnv(EnvBase):
     """N robots at a task, ``batch_size=[N]``.
 
-    It speaks of what a robot senses (``joint_position``, ``joint_velocity``, ``goal``) and leaves what a policy sees to the
-    transforms. Beside them: ``physics_parameters`` (see :class:`physai.physics.ParameterLayout`; read at reset, when given),
-    ``episode_length`` and ``episode_return``. Only the rows of ``_reset`` are reset.
+    It speaks of what a robot senses (``joint_position``, ``joint_velocity``, ``goal``) and leaves what a policy sees
+    to the transforms. Beside them: ``physics_parameters`` (see :class:`physai.physics.ParameterLayout`; read at
+    reset, when given), ``episode_length`` and ``episode_return``. Only the rows of ``_reset`` are reset.
 
     Args:
         config: The environment.

@@ -75,7 +75,7 @@ class Simulation:
 
     @torch.no_grad()
     def reset(self, rows: Tensor | None = None, parameters: Tensor | None = None) -> None:
-        """Start new episodes in the rows of a mask [N] (all by default), with new parameters [N, P] if any are given."""
+        """Start new episodes in the rows of a mask [N] (all by default), with new parameters [N, P] if given."""
         index = torch.arange(self.num_envs) if rows is None else rows.nonzero()[:, 0]
         start = self.task.sample_start(len(index), self.spec, self.generator)
         dynamics = None
@@ -95,8 +95,8 @@ class Simulation:
         """Apply actions [N, n] in [-1, 1] for one control period.
 
         Returns:
-            reward, terminated, truncated, each [N, 1]. Reaching the goal terminates; running out of time truncates, and a
-            step that does both only terminates.
+            reward, terminated, truncated, each [N, 1]. Reaching the goal terminates; running out of time truncates,
+            and a step that does both only terminates.
         """
         command = action.double().clamp(-1.0, 1.0) * self.config.max_velocity
         self._read(*self.physics.step(command.numpy()))

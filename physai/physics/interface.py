@@ -7,8 +7,9 @@ import numpy as np
 from physai.robots import RobotSpec
 
 DynamicsParameters = dict[str, np.ndarray]
-"""Per robot and absolute, each [rows, k]: ``link_mass`` (kg, one a moving link), ``payload`` (kg at the tip, 1), and one a
-joint of ``joint_damping`` (N·m·s/rad), ``joint_friction`` (N·m), ``effort_limit`` (N·m), ``velocity_gain`` (1)."""
+"""Per robot and absolute, each [rows, k]: ``link_mass`` (kg, one a moving link), ``payload`` (kg at the tip, 1), and
+one a joint of ``joint_damping`` (N·m·s/rad), ``joint_friction`` (N·m), ``effort_limit`` (N·m), ``velocity_gain``
+(1)."""
 
 
 def nominal_dynamics(spec: RobotSpec) -> DynamicsParameters:

@@ -6,14 +6,13 @@ from pathlib import Path
 
 import numpy as np
 import pybullet as bullet
-from lxml import etree
 
 from physai.errors import UserError
 from physai.physics.interface import DynamicsParameters, nominal_dynamics
 from physai.robots import RobotSpec, urdf
 
 ROBOTS_PER_WORLD = 16  # the cost of a world grows faster than its robots; 16 is the fastest
-_FIXED_BASE = dict(useFixedBase=True, flags=bullet.URDF_USE_INERTIA_FROM_FILE)
+_FIXED_BASE = {"useFixedBase": True, "flags": bullet.URDF_USE_INERTIA_FROM_FILE}
 
 
 @dataclass(frozen=True)
@@ -23,10 +22,10 @@ class _World:
 
 
 class PyBulletPhysics:
-    """N velocity-controlled robots with a fixed base, in free space under gravity (see :class:`physai.physics.Physics`).
+    """N velocity-controlled robots with a fixed base, in free space under gravity.
 
-    Joints that the spec does not control are welded at zero, and shapes are left out: nothing touches anything here, so the
-    state of a robot is its joint positions and velocities.
+    The interface is :class:`physai.physics.Physics`. Joints that the spec does not control are welded at zero, and
+    shapes are left out: nothing touches anything here, so the state of a robot is its joint positions and velocities.
 
     Each joint is driven by PyBullet's velocity motor with a limited effort. Coulomb friction has no counterpart in
     PyBullet's motors; it takes its share of the effort when the motor speeds a joint up, and helps when it brakes.
@@ -63,10 +62,13 @@ class PyBulletPhysics:
         self._row = [(world.client, body) for world in self._worlds for body in world.bodies]
         n = len(joints)
         self._position, self._velocity = np.zeros((num_robots, n)), np.zeros((num_robots, n))
-        self._parameters = {
-            key: np.repeat(value, num_robots, axis=0) for key, value in nominal_dynamics(spec).items()
-        }
-        self.reset(np.arange(num_robots), np.tile(spec.home, (num_robots, 1)), np.zeros((num_robots, n)), self._parameters)
+        self._parameters = {key: np.repeat(value, num_robots, axis=0) for key, value in nominal_dynamics(spec).items()}
+        self.reset(
+            np.arange(num_robots),
+            np.tile(spec.home, (num_robots, 1)),
+            np.zeros((num_robots, n)),
+            self._parameters,
+        )
 
     def reset(
         self,
@@ -136,7 +138,7 @@ class PyBulletPhysics:
         return self._position.copy(), self._velocity.copy()
 
     def parameters(self) -> DynamicsParameters:
-        """Masses and damping as PyBullet holds them; effort, friction and gain as every step hands them to the motors."""
+        """Masses and damping as PyBullet holds them; the rest as every step hands it to the motors."""
         parameters = {key: value.copy() for key, value in self._parameters.items()}
         for row, (client, body) in enumerate(self._row):
             masses = np.array([bullet.getDynamicsInfo(body, link, client)[0] for link in self._links])
@@ -147,7 +149,11 @@ class PyBulletPhysics:
 
     def state(self) -> dict[str, np.ndarray]:
         """See :meth:`physai.physics.Physics.state`."""
-        return {"joint_position": self._position.copy(), "joint_velocity": self._velocity.copy(), **self._parameters}
+        return {
+            "joint_position": self._position.copy(),
+            "joint_velocity": self._velocity.copy(),
+            **self._parameters,
+        }
 
     def set_state(self, state: dict[str, np.ndarray]) -> None:
         """See :meth:`physai.physics.Physics.set_state`."""
@@ -189,7 +195,7 @@ def _make_world(spec: RobotSpec, model: Path, robots: int, time_step: float) -> 
         for link in range(-1, bullet.getNumJoints(body, client)):
             # The damping that counts is that of the joints.
             bullet.changeDynamics(body, link, linearDamping=0, angularDamping=0, physicsClientId=client)
-            # Even shapeless robots share a broadphase; solved in one island, a robot would feel its neighbours' rounding.
+            # Even shapeless robots meet in the broadphase; solved in one island, they would feel each other's rounding.
             bullet.setCollisionFilterGroupMask(body, link, 0, 0, client)
     return _World(client, bodies)
 

@@ -10,6 +10,7 @@ import pybullet as bullet
 from physai.errors import UserError
 from physai.robots import RobotSpec
 
+
 def has_screen() -> bool:
     """Whether a window can be opened here."""
     return not sys.platform.startswith("linux") or bool(os.environ.get("DISPLAY"))
@@ -47,9 +48,7 @@ class Viewer:
         self._window = window
         self._client = bullet.connect(bullet.GUI if window else bullet.DIRECT)
         flags = bullet.URDF_USE_MATERIAL_COLORS_FROM_MTL
-        self._body = bullet.loadURDF(
-            str(spec.urdf), useFixedBase=True, flags=flags, physicsClientId=self._client
-        )
+        self._body = bullet.loadURDF(str(spec.urdf), useFixedBase=True, flags=flags, physicsClientId=self._client)
         infos = [
             bullet.getJointInfo(self._body, joint, self._client)
             for joint in range(bullet.getNumJoints(self._body, self._client))

@@ -18,12 +18,15 @@ from physai.errors import UserError
 def input_size(observation_spec: Composite, in_keys: Sequence[str], where: str) -> int:
     """Return how many numbers ``in_keys`` of an env bring, or raise a UserError that says where a key is wrong."""
     for key in in_keys:
-        if key not in observation_spec.keys():
-            raise UserError(f"{where}.in_keys: the env gives no '{key}'{nearest(key, observation_spec.keys())}")
+        given = list(observation_spec.keys())
+        if key not in given:
+            raise UserError(f"{where}.in_keys: the env gives no '{key}'{nearest(key, given)}")
     return sum(observation_spec[key].shape[-1] for key in in_keys)
 
 
-def mlp(in_features: int, hidden_sizes: Sequence[int], out_features: int, activation: str) -> nn.Sequential:
+def mlp(
+    in_features: int, hidden_sizes: Sequence[int], out_features: int, activation: str, last_gain: float = 1.0
+) -> nn.Sequential:
     """Build a perceptron with orthogonal weights (Saxe et al., 2014) and zero biases."""
     module, _, name = activation.rpartition(".")
     nonlinearity = getattr(importlib.import_module(module or "torch.nn"), name)
@@ -31,7 +34,7 @@ def mlp(in_features: int, hidden_sizes: Sequence[int], out_features: int, activa
     for size in hidden_sizes:
         layers += [_linear(in_features, size, 2**0.5), nonlinearity()]
         in_features = size
-    return nn.Sequential(*layers, _linear(in_features, out_features, 1.0))
+    return nn.Sequential(*layers, _linear(in_features, out_features, last_gain))
 
 
 def _linear(in_features: int, out_features: int, gain: float) -> nn.Linear:
@@ -48,7 +51,8 @@ class GaussianActor(TensorDictModuleBase):
     parameters and cancels in the probability ratio; but it has an exact log-probability where tanh saturates, and a
     closed-form entropy. In the deterministic exploration mode the latent action is the mean.
 
-    Writes ``action`` [.., n] in (-1, 1), ``latent_action`` [.., n] and ``action_log_prob`` [..] (that of the latent action).
+    Writes ``action`` [.., n] in (-1, 1), ``latent_action`` [.., n] and ``action_log_prob`` [..] (that of the latent
+    action).
 
     Args:
         in_features: Numbers that ``in_keys`` bring.
@@ -75,8 +79,7 @@ class GaussianActor(TensorDictModuleBase):
     ) -> None:
         super().__init__()
         self.in_keys = in_keys
-        self.network = mlp(in_features, hidden_sizes, action_size, activation)
-        nn.init.orthogonal_(self.network[-1].weight, 0.01)  # start near zero velocity
+        self.network = mlp(in_features, hidden_sizes, action_size, activation, last_gain=0.01)  # start near standstill
         self.log_std = nn.Parameter(torch.full((action_size,), initial_std).log())
 
     def mean(self, tensordict: TensorDictBase) -> Tensor:
@@ -86,7 +89,9 @@ class GaussianActor(TensorDictModuleBase):
     def get_dist(self, tensordict: TensorDictBase) -> Distribution:
         """Return the distribution of the latent action."""
         mean = self.mean(tensordict)
-        return Independent(Normal(mean, self.log_std.exp().expand_as(mean), validate_args=False), 1, validate_args=False)
+        return Independent(
+            Normal(mean, self.log_std.exp().expand_as(mean), validate_args=False), 1, validate_args=False
+        )
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Act."""

@@ -19,7 +19,8 @@ class ForwardKinematics(nn.Module):
         spec: The robot; its joints that are not controlled count as held at zero.
 
     Attributes:
-        reach: Length of the stretched arm from its first controlled joint to the tip, m; no point beyond it can be reached.
+        reach: Length of the stretched arm from its first controlled joint to the tip, m; no point beyond it can be
+            reached.
     """
 
     def __init__(self, spec: RobotSpec) -> None:
@@ -51,9 +52,9 @@ class ForwardKinematics(nn.Module):
 
     @torch.jit.export
     def linearize(self, joint_position: Tensor) -> Tensor:
-        """Map joint positions [..., n] in rad to [..., 1 + n, 3]: the end effector in m, then dp/dq of each joint in m/rad."""
+        """Map joint positions [..., n] in rad to [..., 1 + n, 3]: the end effector p in m, then dp/dq in m/rad."""
         cosine, sine = torch.cos(joint_position)[..., None], torch.sin(joint_position)[..., None]
-        vectors = self.tip.expand(joint_position.shape[:-1] + (1, 3))
+        vectors = self.tip.expand(joint_position.shape[:-1] + (1, 3))  # noqa: RUF005 (TorchScript knows no unpacking here)
         for joint in range(self.rotations.shape[0] - 1, -1, -1):
             turned = torch.matmul(vectors, self.rotations[joint])
             across, cross = turned[..., 0:3], turned[..., 3:6]

@@ -15,9 +15,11 @@ from physai.robots import ForwardKinematics, RobotSpec
 class ReachObservation(nn.Module):
     """From what a robot senses to what its policy sees; scriptable, and part of the exported policy.
 
-    The observation is ``[q, qd, ee_x, ee_y, goal_x, goal_y]``. Features say the same in terms that a small network learns from
-    quickly: sine and cosine of the joints, the error e = goal - ee, and Jᵀe, the direction in joint space that shortens it
-    fastest (Khatib, 1987); errors appear once in units of the arm and once, saturated, in units of the tolerance.
+    The observation is ``[q, qd, ee_x, ee_y, goal_x, goal_y]``. Features say the same in terms that a small network
+    learns from
+    quickly: sine and cosine of the joints, the error e = goal - ee, and Jᵀe, the direction in joint space that
+    shortens it fastest (Khatib, 1987); errors appear once in units of the arm and once, saturated, in units of the
+    tolerance.
 
     Args:
         kinematics: The robot's forward kinematics.
@@ -88,7 +90,9 @@ class Reach:
         if inner >= outer:
             raise UserError(f"env.task.goal_radius: the inner radius {inner} must be below the outer radius {outer}")
         if outer > kinematics.reach:
-            raise UserError(f"env.task.goal_radius: {outer} m is beyond the reach of '{spec.name}', {kinematics.reach:.3f} m")
+            raise UserError(
+                f"env.task.goal_radius: {outer} m is beyond the reach of '{spec.name}', {kinematics.reach:.3f} m"
+            )
         if len(self.start_spread) != len(spec.joints):
             raise UserError(f"env.task.start_spread has {len(self.start_spread)} values for {len(spec.joints)} joints")
 
@@ -112,7 +116,7 @@ class Reach:
         return ReachObservation(kinematics, self.tolerance)
 
     def observation_bounds(self, spec: RobotSpec, kinematics: ForwardKinematics) -> tuple[Tensor, Tensor]:
-        """Lower and upper bound of an observation, [2n + 4] each, with some room, for limits of joints are not walls."""
+        """Lower and upper bound of an observation, [2n + 4] each; with room, for joint limits are not walls."""
         velocity = 2.0 * torch.from_numpy(spec.velocity_limit)
         lower, upper = torch.from_numpy(spec.position_limit).T
         end_effector = torch.full((2,), kinematics.reach * 1.01)

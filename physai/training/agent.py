@@ -50,7 +50,11 @@ class Agent:
         inputs = input_size(env.observation_spec, config.policy.critic["in_keys"], "policy.critic")
         critic = _make("policy.critic", config.policy.critic, in_features=inputs)
         algorithm = _make(
-            "algo", config.algo, actor=actor, critic=critic, frames_per_batch=config.collector.frames_per_batch
+            "algo",
+            config.algo,
+            actor=actor,
+            critic=critic,
+            frames_per_batch=config.collector.frames_per_batch,
         )
         collector = make_collector(config.collector, env, actor, config.total_frames)
         return cls(env, actor, critic, algorithm, collector)
@@ -79,9 +83,7 @@ class Agent:
 def make_actor(config: TrainConfig, env: TransformedRobotEnv) -> TensorDictModuleBase:
     """Build an untrained actor for an env."""
     inputs = input_size(env.observation_spec, config.policy.actor["in_keys"], "policy.actor")
-    return _make(
-        "policy.actor", config.policy.actor, in_features=inputs, action_size=env.action_spec.shape[-1]
-    )
+    return _make("policy.actor", config.policy.actor, in_features=inputs, action_size=env.action_spec.shape[-1])
 
 
 def load_policy_state(actor: TensorDictModuleBase, env: TransformedRobotEnv, state: dict[str, Any]) -> None:

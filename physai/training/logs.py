@@ -47,7 +47,12 @@ class CsvLog:
 
 
 EPISODE_COLUMNS = ("frame", "return", "length", "success")
-EVALUATION_COLUMNS = ("evaluation/success_rate", "evaluation/steps_to_goal", "evaluation/final_distance", "evaluation/return")
+EVALUATION_COLUMNS = (
+    "evaluation/success_rate",
+    "evaluation/steps_to_goal",
+    "evaluation/final_distance",
+    "evaluation/return",
+)
 TIME_COLUMNS = ("time/seconds", "time/collect", "time/update", "time/frames_per_second")
 
 
@@ -116,5 +121,5 @@ class RunLog:
         if self._metrics is not None:
             self._metrics.close()
         writer = getattr(self._logger, "experiment", None)
-        if hasattr(writer, "close"):
+        if writer is not None:
             writer.close()

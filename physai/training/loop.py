@@ -75,7 +75,9 @@ def train(config: TrainConfig, run_dir: Path, resume: bool) -> tuple[Agent, Cloc
         raise UserError(_keep_evidence(error, clock, run_dir, folder)) from error
     except OSError as error:
         kept = folder.paths()[-1] if folder.paths() else "none yet"
-        raise UserError(f"cannot write to {run_dir}: {error.strerror or error}; last good checkpoint: {kept}") from error
+        raise UserError(
+            f"cannot write to {run_dir}: {error.strerror or error}; last good checkpoint: {kept}"
+        ) from error
     finally:
         log.close()
         judge.close()
@@ -97,7 +99,11 @@ def _loop(
         started = time.perf_counter()
         batch = next(batches)
         collected = time.perf_counter()
-        first_frame, clock.frames, clock.iteration = clock.frames, clock.frames + batch.numel(), clock.iteration + 1
+        first_frame, clock.frames, clock.iteration = (
+            clock.frames,
+            clock.frames + batch.numel(),
+            clock.iteration + 1,
+        )
         _check_finite(batch)
         agent.env.normalization.update(batch.get("observation"))
         values = log.episodes(batch, first_frame) | agent.algorithm.update(batch)
@@ -132,7 +138,11 @@ def _check_finite(batch: TensorDictBase) -> None:
 
 
 def _evaluate(
-    config: TrainConfig, agent: Agent, judge: TransformedRobotEnv, clock: Clock, folder: checkpoint.CheckpointFolder
+    config: TrainConfig,
+    agent: Agent,
+    judge: TransformedRobotEnv,
+    clock: Clock,
+    folder: checkpoint.CheckpointFolder,
 ) -> dict[str, Any]:
     """Judge the policy, and keep it if it is the best so far: by success rate, then by return."""
     judge.normalization.load_state_dict(agent.env.normalization.state_dict())

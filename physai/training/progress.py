@@ -47,10 +47,9 @@ class Progress:
     def update(self, frames: int, frames_per_second: float, values: dict[str, float]) -> None:
         """Show how far the run is."""
         success = values.get("evaluation/success_rate")
-        changed = {} if success is None else {"success": f"success {success:.1%}"}
-        self._bar.update(
-            self._task, completed=min(frames, self._total), speed=f"{frames_per_second:,.0f}/s", **changed
-        )
+        self._bar.update(self._task, completed=min(frames, self._total), speed=f"{frames_per_second:,.0f}/s")
+        if success is not None:
+            self._bar.update(self._task, success=f"success {success:.1%}")
         if not self._terminal and success is not None:
             spent = time.monotonic() - self._started
             left = spent / max(1, frames - self._first) * max(0, self._total - frames)

@@ -10,10 +10,10 @@ from torchrl.envs.transforms import Transform
 class ObservationNormalization(Transform):
     """Writes ``normalized_observation = clamp((observation - loc) / scale)``.
 
-    The statistics are fixed while a batch is collected; the learner calls ``update`` once per collected batch. They are exact
-    (Chan, Golub and LeVeque, "Algorithms for computing the sample variance", 1983), in float64, and part of ``state_dict``.
-    (TorchRL's VecNormV2 counts untouched rows again at partial resets, keeps statistics per robot, and does not freeze in
-    evaluation.)
+    The statistics are fixed while a batch is collected; the learner calls ``update`` once per collected batch. They
+    are exact (Chan, Golub and LeVeque, "Algorithms for computing the sample variance", 1983), in float64, and part
+    of ``state_dict``. (TorchRL's VecNormV2 counts untouched rows again at partial resets, keeps statistics per
+    robot, and does not freeze in evaluation.)
 
     Args:
         size: Length of an observation.
@@ -47,9 +47,7 @@ class ObservationNormalization(Transform):
         else:
             delta, share = mean - self.mean, len(batch) / count
             self.mean = self.mean + delta * share
-            self.variance = (
-                self.variance * (1 - share) + variance * share + delta.square() * share * (1 - share)
-            )
+            self.variance = self.variance * (1 - share) + variance * share + delta.square() * share * (1 - share)
         self.count = count
         self.loc = self.mean.float()
         self.scale = self.variance.sqrt().float().clamp(min=self.eps)

@@ -1,7 +1,7 @@
 """Domain randomization: every episode of every robot draws its own physics, actuators and sensors.
 
-After Tobin et al., "Domain Randomization for Transferring Deep Neural Networks from Simulation to the Real World", 2017,
-and Peng et al., "Sim-to-Real Transfer of Robotic Control with Dynamics Randomization", 2018.
+After Tobin et al., "Domain Randomization for Transferring Deep Neural Networks from Simulation to the Real World",
+2017, and Peng et al., "Sim-to-Real Transfer of Robotic Control with Dynamics Randomization", 2018.
 """
 
 import math
@@ -66,7 +66,7 @@ class Normal(Config):
     operation: Operation
 
     def sample(self, draw: Tensor) -> Tensor:
-        """Turn uniform numbers in [0, 1) into draws (by inversion; a draw beyond 5 standard deviations is cut there)."""
+        """Turn uniform numbers in [0, 1) into draws by inversion, cut at 5 standard deviations."""
         return self.mean + self.std * torch.special.ndtri(draw).clamp(-5.0, 5.0)
 
 
@@ -109,8 +109,8 @@ class RandomizationConfig(Config):
 class DomainRandomization(StochasticTransform):
     """Draws ``physics_parameters`` [N, P] for the rows that are reset; the env applies them, and they stay readable.
 
-    Every column of a parameter draws for itself: each joint has a friction of its own. Values that must not be negative are
-    cut at zero (masses and gains just above), delays are rounded to whole control steps.
+    Every column of a parameter draws for itself: each joint has a friction of its own. Values that must not be
+    negative are cut at zero (masses and gains just above), delays are rounded to whole control steps.
 
     Args:
         config: What to draw.

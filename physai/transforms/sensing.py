@@ -13,7 +13,8 @@ class SensorModel(StochasticTransform):
     Reward and success stay those of the true state.
 
     Args:
-        layout: Tells where ``encoder_offset``, ``position_noise`` and ``velocity_noise`` stand in ``physics_parameters``.
+        layout: Tells where ``encoder_offset``, ``position_noise`` and ``velocity_noise`` stand in
+            ``physics_parameters``.
         seed: Seeds the noise.
     """
 

@@ -103,7 +103,11 @@ def test_the_ppo_objective_clips_the_ratio_of_the_latent_actions():
     with torch.no_grad():
         for parameter in critic.network.parameters():
             parameter.zero_()
-    overrides = ["algo.loss.normalize_advantage=false", "algo.loss.clip_epsilon=0.2", "algo.loss.critic_coeff=0.5"]
+    overrides = [
+        "algo.loss.normalize_advantage=false",
+        "algo.loss.clip_epsilon=0.2",
+        "algo.loss.critic_coeff=0.5",
+    ]
     losses = build(actor, critic, 3, *overrides).loss(data)
     assert losses["loss_objective"].item() == pytest.approx(expected, rel=1e-5)
     assert losses["loss_critic"].item() == pytest.approx(0.5 * (1 + 4 + 9) / 3, rel=1e-5)
@@ -129,9 +133,15 @@ def test_an_update_changes_the_weights_and_reports_what_matters():
     metrics = algorithm.update(batch)
     after = [*actor.parameters(), *critic.parameters()]
     assert all(not torch.equal(old, new) for old, new in zip(before, after, strict=True))
-    assert {"loss_objective", "loss_critic", "kl_approx", "clip_fraction", "entropy", "explained_variance", "lr"} <= set(
-        metrics
-    )
+    assert {
+        "loss_objective",
+        "loss_critic",
+        "kl_approx",
+        "clip_fraction",
+        "entropy",
+        "explained_variance",
+        "lr",
+    } <= set(metrics)
 
 
 def test_the_learning_rate_falls_along_its_schedule():
@@ -155,7 +165,7 @@ def test_state_continues_bit_for_bit():
     actor, critic, batch = small_batch()
     algorithm = build(actor, critic, 32, "algo.buffer.batch_size=8")
     algorithm.update(batch.clone())
-    state, random = {k: v for k, v in algorithm.state().items()}, torch.get_rng_state()
+    state, random = algorithm.state(), torch.get_rng_state()
     state = torch.load(_saved(state), weights_only=True)
     expected = algorithm.update(batch.clone())
     other_actor, other_critic, _ = small_batch()

@@ -10,7 +10,7 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 from stable_baselines3.common.env_checker import check_env as check_env_sb3
 
-import physai  # noqa: F401  (registers the ids)
+import physai
 
 IDS = ["physai/Reacher-v0", "physai/KukaReacher-v0"]
 
@@ -95,7 +95,11 @@ def test_one_env_and_the_torchrl_env_play_the_same_episode(make):
         observation, reward, terminated, truncated, _ = env.step(action)
         td = batched.step(td.set("action", torch.from_numpy(action)[None]))["next"]
         np.testing.assert_array_equal(td["observation"][0].numpy(), observation)
-        assert (float(td["reward"]), bool(td["terminated"]), bool(td["truncated"])) == (reward, terminated, truncated)
+        assert (float(td["reward"]), bool(td["terminated"]), bool(td["truncated"])) == (
+            reward,
+            terminated,
+            truncated,
+        )
     batched.close()
 
 

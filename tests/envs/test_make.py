@@ -121,7 +121,7 @@ def test_a_rollout_of_staggered_episodes_is_consistent(make_env, name, randomiza
     assert len({tuple(end) for end in ends}) > 4  # staggered indeed
     going, over = ~done[:, :-1], done[:, :-1]
     follows = seen[:, 1:]
-    for key in follows.exclude("next", "action").keys():
+    for key in follows.exclude("next", "action").keys():  # noqa: SIM118 (iterating a TensorDict gives its rows)
         assert torch.equal(follows[key][going], seen["next", key][:, :-1][going]), key
     assert (follows["episode_length"][over] == 0).all()
     assert (seen["next", "episode_length"] == seen["episode_length"] + 1).all()

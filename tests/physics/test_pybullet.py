@@ -278,9 +278,7 @@ def test_friction_helps_to_brake(planar, make, target):
     assert rubbing == pytest.approx(2.0 - (2.0 - frictionless) * (0.3 + 0.2) / 0.3, abs=0.02)
 
 
-@pytest.mark.parametrize(
-    "changes", [{"payload": [0.0, 1.0]}, {"link_mass": [0.5, 2.0]}], ids=["payload", "link_mass"]
-)
+@pytest.mark.parametrize("changes", [{"payload": [0.0, 1.0]}, {"link_mass": [0.5, 2.0]}], ids=["payload", "link_mass"])
 def test_a_heavier_robot_speeds_up_more_slowly(planar, make, changes):
     physics = make(planar, 2)
     found = speeds(physics, dynamics(planar, 2, effort_limit=0.5, **changes), 4)[-1, :, 0]

@@ -66,7 +66,8 @@ def test_a_missing_file_is_named(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "uri", ["package://no_such_package_here/arm.urdf", "package://no.such.package/arm.urdf", "package:///arm.urdf"]
+    "uri",
+    ["package://no_such_package_here/arm.urdf", "package://no.such.package/arm.urdf", "package:///arm.urdf"],
 )
 def test_an_unknown_package_is_named(uri):
     message = message_of(uri)
@@ -102,7 +103,10 @@ def test_a_missing_file_in_a_package_is_named():
         (replaced('lower="-2.6"', 'lower="3"'), ["joint2", "lower", "upper"]),
         (replaced('effort="3.0"', 'effort="0"'), ["joint2", "effort"]),
         (replaced('velocity="2.5"', 'velocity="fast"', 'name="joint2"'), ["joint2", "velocity", "fast"]),
-        (replaced('<joint name="joint2" type="revolute">', '<joint name="joint2" type="prismatic">'), ["joint2"]),
+        (
+            replaced('<joint name="joint2" type="revolute">', '<joint name="joint2" type="prismatic">'),
+            ["joint2"],
+        ),
         (replaced('<origin xyz="0.30 0 0"/>', '<origin xyz="0.30 0"/>'), ["joint2", "origin"]),
         (replaced('<axis xyz="0 0 1"/>', '<axis xyz="0 0 0"/>', 'name="joint2"'), ["joint2", "axis"]),
         (replaced('<link name="tool">', '<link name="link2">'), ["link2"]),

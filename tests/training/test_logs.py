@@ -52,7 +52,10 @@ def test_a_resumed_log_forgets_what_came_after_its_checkpoint(tmp_path):
     again = RunLog(tmp_path, Scalars(), state)
     again.metrics(20, 2, {"loss": 0.3})
     again.close()
-    assert [(row["frames"], row["loss"]) for row in rows(tmp_path / "metrics.csv")] == [("10", "0.5"), ("20", "0.3")]
+    assert [(row["frames"], row["loss"]) for row in rows(tmp_path / "metrics.csv")] == [
+        ("10", "0.5"),
+        ("20", "0.3"),
+    ]
     assert rows(tmp_path / "episodes.csv") == []
 
 

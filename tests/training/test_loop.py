@@ -51,11 +51,17 @@ def test_a_run_folder_tells_its_whole_story(finished):
     assert (run / "training.png").read_bytes().startswith(b"\x89PNG")
     assert [int(row["frames"]) for row in metrics(run)] == list(range(1024, 16385, 1024))
     assert len((run / "episodes.csv").read_text().splitlines()) > 10
-    assert "success rate" in output and "95 % interval" in output
+    assert "success rate" in output
+    assert "95 % interval" in output
     events = EventAccumulator(str(run / "tensorboard")).Reload()
-    assert {"episode/return", "loss_objective", "kl_approx", "lr", "time/frames_per_second", "grad_norm"} <= set(
-        events.Tags()["scalars"]
-    )
+    assert {
+        "episode/return",
+        "loss_objective",
+        "kl_approx",
+        "lr",
+        "time/frames_per_second",
+        "grad_norm",
+    } <= set(events.Tags()["scalars"])
 
 
 def test_one_seed_gives_one_run_and_another_seed_another(finished, tmp_path):
@@ -149,7 +155,9 @@ def test_a_simulation_that_is_not_finite_stops_the_run(tmp_path, monkeypatch):
         calls += 1
         reset(self, rows, parameters)
         if calls == 30:  # a broken model would do the same to the joint states
-            self.physics.set_state(self.physics.state() | {"joint_velocity": self.physics.state()["joint_velocity"] * float("nan")})
+            self.physics.set_state(
+                self.physics.state() | {"joint_velocity": self.physics.state()["joint_velocity"] * float("nan")}
+            )
             self._read(*self.physics.joint_state())
 
     monkeypatch.setattr(Simulation, "reset", poisoned)

@@ -10,13 +10,12 @@ from physai.physics import ParameterLayout
 from physai.robots import RobotSpec
 from physai.transforms import DomainRandomization, RandomizationConfig
 
-NOTHING = {
-    name: None
-    for name in (
+NOTHING = dict.fromkeys(
+    (
         *("link_mass", "payload", "joint_damping", "joint_friction", "effort_limit", "velocity_gain"),
         *("actuator_delay", "encoder_offset", "position_noise", "velocity_noise"),
     )
-}
+)
 
 
 def config(**draws):
@@ -68,10 +67,18 @@ def draw(layout, rows=3000, seed=0, **draws):
 @pytest.mark.parametrize(
     ("name", "settings", "distribution"),
     [
-        ("link_mass", uniform(0.8, 1.2, "scale"), lambda nominal: stats.uniform(0.8 * nominal, 0.4 * nominal)),
+        (
+            "link_mass",
+            uniform(0.8, 1.2, "scale"),
+            lambda nominal: stats.uniform(0.8 * nominal, 0.4 * nominal),
+        ),
         ("link_mass", uniform(0.1, 0.3, "add"), lambda nominal: stats.uniform(nominal + 0.1, 0.2)),
         ("payload", uniform(0.5, 1.5), lambda _: stats.uniform(0.5, 1.0)),
-        ("effort_limit", log_uniform(0.5, 2.0, "scale"), lambda nominal: stats.loguniform(0.5 * nominal, 2 * nominal)),
+        (
+            "effort_limit",
+            log_uniform(0.5, 2.0, "scale"),
+            lambda nominal: stats.loguniform(0.5 * nominal, 2 * nominal),
+        ),
         ("joint_damping", log_uniform(0.01, 1.0), lambda _: stats.loguniform(0.01, 1.0)),
         ("velocity_gain", normal(1.0, 0.1, "scale"), lambda nominal: stats.norm(nominal, 0.1 * nominal)),
         ("encoder_offset", normal(0.1, 0.02), lambda _: stats.norm(0.1, 0.02)),
@@ -108,7 +115,14 @@ def test_delays_are_whole_steps_up_to_the_longest(layout):
 
 
 def test_what_must_not_be_negative_is_not(layout):
-    for name in ("payload", "joint_damping", "joint_friction", "effort_limit", "position_noise", "velocity_noise"):
+    for name in (
+        "payload",
+        "joint_damping",
+        "joint_friction",
+        "effort_limit",
+        "position_noise",
+        "velocity_noise",
+    ):
         assert draw(layout, **{name: normal(0.0, 1.0)})[0].min() == 0
     for name in ("link_mass", "velocity_gain"):
         assert draw(layout, **{name: normal(0.0, 1.0)})[0].min() > 0
