@@ -214,24 +214,22 @@ def test_the_engine_itself_holds_the_masses_inertias_and_dampings(planar, make):
     physics = make(planar, 1)
     (client,) = open_clients() - before
     body = bullet.getBodyUniqueId(0, client)
-    unit = {
-        bullet.getJointInfo(body, index, client)[12].decode(): np.array(bullet.getDynamicsInfo(body, index, client)[2])
-        for index in range(bullet.getNumJoints(body, client))
-    }
     wanted = dynamics(planar, 1, payload=0.7)
     wanted["link_mass"] = np.array([[1.5, 0.9, 0.2]])
     wanted["joint_damping"] = np.array([[0.4, 0.6]])
     reset_all(physics, np.zeros((1, 2)), np.zeros((1, 2)), wanted)
     masses = dict(zip(planar.moving_links, [1.5, 0.9, 0.9], strict=True))
     dampings = {"joint1": 0.4, "joint2": 0.6}
-    nominal = dict(zip(planar.moving_links, planar.link_mass, strict=True))
+    nominal = {"link1": 1.0, "link2": 0.6, "tool": 0.05}
+    inertia = {"link1": [0.00033, 0.00763, 0.00771], "link2": [0.00011, 0.00316, 0.00319], "tool": [2e-5, 2e-5, 1e-5]}
+    inertia = {link: np.array(moments) for link, moments in inertia.items()}
     bullet.syncBodyInfo(client)  # getJointInfo answers from a cache that changeDynamics does not reach
     for index in range(bullet.getNumJoints(body, client)):
         info = bullet.getJointInfo(body, index, client)
         joint, link = info[1].decode(), info[12].decode()
         found = bullet.getDynamicsInfo(body, index, client)
         assert found[0] == pytest.approx(masses[link])
-        np.testing.assert_allclose(found[2], unit[link] * masses[link] / nominal[link], rtol=1e-9)
+        np.testing.assert_allclose(found[2], inertia[link] * masses[link] / nominal[link], rtol=1e-6)
         if joint in dampings:
             assert info[6] == pytest.approx(dampings[joint])
 
@@ -290,6 +288,25 @@ def test_damping_slows_an_arm_whose_motors_are_off(planar, make):
     parameters = dynamics(planar, 3, effort_limit=0.0, joint_friction=0.0, joint_damping=[0.0, 0.2, 1.0])
     found = speeds(physics, parameters, 10, qd=1.0)[-1, :, 0]
     assert found[2] < 0.9 * found[1] < 0.9 * found[0]
+
+
+def test_an_arm_without_motor_friction_and_damping_keeps_turning(planar, make):
+    physics = make(planar, 1)
+    parameters = dynamics(planar, 1, joint_friction=0.0, joint_damping=0.0)
+    parameters["effort_limit"] = np.array([[0.0, 100.0]])  # the second joint is held
+    reset_all(physics, np.zeros((1, 2)), np.array([[1.0, 0.0]]), parameters)
+    assert run(physics, np.zeros((50, 1, 2)))[-1, 1, 0, 0] == pytest.approx(1.0, abs=1e-3)
+
+
+def test_torque_over_inertia_is_the_acceleration(planar, make):
+    physics = make(planar, 1)
+    parameters = dynamics(planar, 1, joint_friction=0.0, joint_damping=0.0, payload=0.3)
+    parameters["effort_limit"] = np.array([[0.8, 100.0]])
+    reset_all(physics, np.zeros((1, 2)), np.zeros((1, 2)), parameters)
+    speed = run(physics, np.tile([2.0, 0.0], (5, 1, 1)))[-1, 1, 0, 0]
+    # about joint 1, with the arm stretched; the payload enlarges the tool, its own inertia too
+    inertia = 0.00771 + 1.0 * 0.15**2 + 0.00319 + 0.6 * 0.425**2 + 1e-5 * 7 + 0.35 * 0.55**2
+    assert speed == pytest.approx(5 * DT * 0.8 / inertia, rel=0.01)
 
 
 def test_a_payload_pulls_a_weak_kuka_down(kuka_reacher, make):
