@@ -22,7 +22,7 @@ class RobotEnv(EnvBase):
     """
 
     def __init__(self, config: EnvConfig, num_envs: int, seed: int = 0) -> None:
-        super().__init__(device="cpu", batch_size=[num_envs])
+        super().__init__(device=None, batch_size=[num_envs])  # a device would be checked and cast to at every step
         self.simulation = Simulation(config, num_envs, seed)
         joints = len(self.simulation.spec.joints)
         goal, parameters = self.simulation.task.goal_size, len(self.simulation.layout.nominal)

@@ -112,7 +112,7 @@ class PyBulletPhysics:
         gains = self._parameters["velocity_gain"].tolist()
         command, read, joints = bullet.setJointMotorControl2, bullet.getJointStates, self._joints
         mode = bullet.VELOCITY_CONTROL
-        states = []
+        flat: list[float] = []
         row = 0
         for world in self._worlds:
             client = world.client
@@ -123,14 +123,15 @@ class PyBulletPhysics:
             for _ in range(self.substeps):
                 bullet.stepSimulation(client)
             for body in world.bodies:
-                states.append([state[:2] for state in read(body, joints, client)])
-        state = np.array(states)
+                for state in read(body, joints, client):
+                    flat += state[:2]
+        state = np.array(flat).reshape(self.num_robots, len(joints), 2)
         self._position, self._velocity = state[..., 0].copy(), state[..., 1].copy()
-        return self._position.copy(), self._velocity.copy()
+        return self.joint_state()
 
     def _available_effort(self, command: np.ndarray) -> np.ndarray:
         limit, friction = self._parameters["effort_limit"], self._parameters["joint_friction"]
-        braking = (command * self._velocity >= 0) & (np.abs(command) < np.abs(self._velocity))
+        braking = (command - self._velocity) * self._velocity < 0
         return np.maximum(limit + np.where(braking, friction, -friction), 0.0)
 
     def joint_state(self) -> tuple[np.ndarray, np.ndarray]:
@@ -140,6 +141,8 @@ class PyBulletPhysics:
     def parameters(self) -> DynamicsParameters:
         """Masses and damping as PyBullet holds them; the rest as every step hands it to the motors."""
         parameters = {key: value.copy() for key, value in self._parameters.items()}
+        for world in self._worlds:
+            bullet.syncBodyInfo(world.client)  # getJointInfo answers from a copy that changeDynamics does not reach
         for row, (client, body) in enumerate(self._row):
             masses = np.array([bullet.getDynamicsInfo(body, link, client)[0] for link in self._links])
             masses[self._tip] -= parameters["payload"][row, 0]
@@ -152,7 +155,7 @@ class PyBulletPhysics:
         return {
             "joint_position": self._position.copy(),
             "joint_velocity": self._velocity.copy(),
-            **self._parameters,
+            **{key: value.copy() for key, value in self._parameters.items()},
         }
 
     def set_state(self, state: dict[str, np.ndarray]) -> None:

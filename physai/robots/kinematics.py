@@ -48,7 +48,14 @@ class ForwardKinematics(nn.Module):
 
     def forward(self, joint_position: Tensor) -> Tensor:
         """Map joint positions [..., n] in rad to end-effector positions [..., 3] in m."""
-        return self.linearize(joint_position)[..., 0, :]
+        cosine, sine = torch.cos(joint_position), torch.sin(joint_position)
+        point = self.tip
+        for joint in range(self.rotations.shape[0] - 1, -1, -1):
+            across, cross, along = torch.matmul(point, self.rotations[joint]).split(3, dim=-1)
+            point = along + self.offsets[joint]
+            point = torch.addcmul(point, across, cosine[..., joint : joint + 1])
+            point = torch.addcmul(point, cross, sine[..., joint : joint + 1])
+        return point
 
     @torch.jit.export
     def linearize(self, joint_position: Tensor) -> Tensor:
@@ -56,11 +63,10 @@ class ForwardKinematics(nn.Module):
         cosine, sine = torch.cos(joint_position)[..., None], torch.sin(joint_position)[..., None]
         vectors = self.tip.expand(joint_position.shape[:-1] + (1, 3))  # noqa: RUF005 (TorchScript knows no unpacking here)
         for joint in range(self.rotations.shape[0] - 1, -1, -1):
-            turned = torch.matmul(vectors, self.rotations[joint])
-            across, cross = turned[..., 0:3], turned[..., 3:6]
+            across, cross, along = torch.matmul(vectors, self.rotations[joint]).split(3, dim=-1)
             c, s = cosine[..., joint : joint + 1, :], sine[..., joint : joint + 1, :]
-            slope = cross[..., 0:1, :] * c - across[..., 0:1, :] * s
-            turned = across * c + cross * s + turned[..., 6:9]
+            slope = cross[..., :1, :] * c - across[..., :1, :] * s
+            turned = torch.addcmul(torch.addcmul(along, across, c), cross, s)
             # Only the point moves with the offset; slopes are directions.
-            vectors = torch.cat([turned[..., 0:1, :] + self.offsets[joint], slope, turned[..., 1:, :]], dim=-2)
+            vectors = torch.cat([turned[..., :1, :] + self.offsets[joint], slope, turned[..., 1:, :]], dim=-2)
         return vectors

@@ -135,6 +135,8 @@ def _check_driven(path: Path, joint: yourdfpy.Joint) -> None:
     where = f"{path}: joint '{joint.name}'"
     if joint.type not in ("revolute", "continuous"):
         raise UserError(f"{where} is {joint.type}: only revolute and continuous joints can be driven")
+    if not np.any(joint.axis):
+        raise UserError(f"{where}: its <axis> is zero")
     if joint.limit is None:
         raise UserError(f"{where} has no <limit>: effort and velocity are needed")
     if not (joint.limit.effort or 0) > 0 or not (joint.limit.velocity or 0) > 0:

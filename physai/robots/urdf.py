@@ -32,7 +32,7 @@ def resolve(uri: str) -> Path:
         package, _, inside = uri.removeprefix("package://").partition("/")
         try:
             path = Path(str(importlib.resources.files(package))) / inside
-        except ModuleNotFoundError:
+        except (ModuleNotFoundError, ValueError):
             raise UserError(f"{uri}: there is no Python package '{package}' here") from None
     if not path.is_file():
         raise UserError(f"{uri}: no such URDF file ({path})")
@@ -47,8 +47,8 @@ def parse(path: Path) -> etree._ElementTree:
     """
     try:
         tree = etree.parse(path, etree.XMLParser(remove_comments=True))
-    except etree.XMLSyntaxError as error:
-        raise UserError(f"{path}: not well-formed XML: {error.msg}") from None
+    except (etree.XMLSyntaxError, OSError) as error:
+        raise UserError(f"{path}: not well-formed XML: {' '.join(str(error).split())}") from None
     root = tree.getroot()
     if root.tag != "robot" or "name" not in root.attrib:
         raise UserError(f"{path}: the top element must be <robot name=...>, found <{root.tag}>")
@@ -74,8 +74,8 @@ def load(path: Path) -> yourdfpy.URDF:
     logging.getLogger("yourdfpy").setLevel(logging.ERROR)
     try:
         return yourdfpy.URDF.load(str(path), build_scene_graph=False, load_meshes=False)
-    except (KeyError, ValueError, TypeError) as error:
-        raise UserError(f"{path}: not a valid URDF: {error!r}") from None
+    except (KeyError, ValueError, TypeError, IndexError) as error:
+        raise UserError(f"{path}: not a valid URDF: {' '.join(repr(error).split())}") from None
 
 
 def _named(path: Path, element: etree._Element) -> str:
@@ -90,13 +90,17 @@ def _check_numbers(path: Path, element: etree._Element) -> None:
     for tag, attributes in _NUMERIC.items():
         for child in element.iter(tag):
             for attribute in attributes:
-                for text in child.get(attribute, "0").split():
-                    try:
-                        finite = math.isfinite(float(text))
-                    except ValueError:
-                        finite = False
-                    if not finite:
-                        raise UserError(f"{where}: <{tag} {attribute}> is '{text}', which is not a finite number")
+                text = child.get(attribute)
+                wanted = 3 if attribute in ("xyz", "rpy") else 1
+                if text is None:
+                    continue
+                try:
+                    numbers = [float(part) for part in text.split()]
+                except ValueError:
+                    numbers = []
+                if len(numbers) != wanted or not all(map(math.isfinite, numbers)):
+                    many = "a finite number" if wanted == 1 else "three finite numbers"
+                    raise UserError(f"{where}: <{tag} {attribute}> is '{text}', which is not {many}")
 
 
 def _check_inertial(path: Path, link: etree._Element) -> None:

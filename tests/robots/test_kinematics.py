@@ -111,7 +111,7 @@ def test_slopes_equal_the_gradient_and_the_first_row_the_position(spec):
         position_and_slopes = kinematics.linearize(q)
         jacobian = torch.autograd.functional.jacobian(kinematics, q)
         torch.testing.assert_close(position_and_slopes[1:], jacobian.T, rtol=0, atol=1e-12)
-        assert torch.equal(position_and_slopes[0], kinematics(q))
+        torch.testing.assert_close(position_and_slopes[0], kinematics(q), rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("shape", [(), (1,), (7,), (3, 5)])
