@@ -34,7 +34,7 @@ from physai.training.agent import Agent, make_actor, make_evaluation_env
 from physai.training.config import TrainConfig
 from physai.training.evaluation import evaluate
 
-ROBOTS = (1, 16, 64, 128, 256, 1024)
+ROBOTS = (1, 16, 64, 128, 256, 512, 1024)
 ROUNDS = 7
 BATCHES_PER_ROUND = 7  # longer than an episode, so that every round pays for its resets
 

@@ -60,7 +60,7 @@ class OnPolicy:
                 f"algo.buffer.batch_size: a minibatch of {buffer.batch_size} is larger than a batch, "
                 f"collector.frames_per_batch={frames_per_batch}"
             )
-        self.loss = loss(actor_network=actor, critic_network=critic)
+        self.loss: Any = loss(actor_network=actor, critic_network=critic)
         self.advantage = advantage(value_network=critic)
         self.buffer = buffer
         self.optimizer = optimizer(self.loss.parameters())

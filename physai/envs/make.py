@@ -80,7 +80,10 @@ class TransformedRobotEnv(TransformedEnv):
 
     def state(self) -> dict[str, dict[str, Tensor]]:
         """Return the state of robots, episodes, transforms and random numbers."""
-        return {"simulation": self.simulation.state(), "transforms": {k: v.clone() for k, v in self.transform.state_dict().items()}}
+        return {
+            "simulation": self.simulation.state(),
+            "transforms": {k: v.clone() for k, v in self.transform.state_dict().items()},
+        }
 
     def set_state(self, state: dict[str, dict[str, Tensor]]) -> None:
         """Restore what ``state`` returned, in an env made from the same config."""

@@ -59,6 +59,7 @@ class PyBulletPhysics:
         self._links: list[int] = links
         self._unit_inertia = masses
         self._tip = spec.moving_links.index(spec.end_effector)
+        self._motors = [[(body, joint) for body in world.bodies for joint in joints] for world in self._worlds]
         self._row = [(world.client, body) for world in self._worlds for body in world.bodies]
         n = len(joints)
         self._position, self._velocity = np.zeros((num_robots, n)), np.zeros((num_robots, n))
@@ -107,21 +108,22 @@ class PyBulletPhysics:
 
     def step(self, velocity_command: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """See :meth:`physai.physics.Physics.step`."""
-        effort = self._available_effort(velocity_command)
-        targets, efforts = velocity_command.tolist(), effort.tolist()
-        gains = self._parameters["velocity_gain"].tolist()
-        command, read, joints = bullet.setJointMotorControl2, bullet.getJointStates, self._joints
-        mode = bullet.VELOCITY_CONTROL
+        # One flat pass over all joints of all robots: this loop is what collection costs most.
+        commands = zip(
+            velocity_command.ravel().tolist(),
+            self._available_effort(velocity_command).ravel().tolist(),
+            self._parameters["velocity_gain"].ravel().tolist(),
+            strict=True,
+        )
+        command, step, read = bullet.setJointMotorControl2, bullet.stepSimulation, bullet.getJointStates
+        mode, joints = bullet.VELOCITY_CONTROL, self._joints
         flat: list[float] = []
-        row = 0
-        for world in self._worlds:
+        for world, motors in zip(self._worlds, self._motors, strict=True):
             client = world.client
-            for body in world.bodies:
-                for joint, target, limit, gain in zip(joints, targets[row], efforts[row], gains[row]):  # noqa: B905
-                    command(body, joint, mode, 0.0, target, limit, 0.1, gain, 0.0, client)
-                row += 1
+            for (body, joint), (target, effort, gain) in zip(motors, commands, strict=False):
+                command(body, joint, mode, 0.0, target, effort, 0.1, gain, 0.0, client)
             for _ in range(self.substeps):
-                bullet.stepSimulation(client)
+                step(client)
             for body in world.bodies:
                 for state in read(body, joints, client):
                     flat += state[:2]

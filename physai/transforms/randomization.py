@@ -106,6 +106,9 @@ class RandomizationConfig(Config):
         return max(0, math.floor((draw.mean + 5 * draw.std if isinstance(draw, Normal) else draw.high) + 0.5))
 
 
+_LOWEST = {"link_mass": 1e-3, "velocity_gain": 1e-3, "encoder_offset": -math.inf}  # and zero for the others
+
+
 class DomainRandomization(StochasticTransform):
     """Draws ``physics_parameters`` [N, P] for the rows that are reset; the env applies them, and they stay readable.
 
@@ -124,25 +127,21 @@ class DomainRandomization(StochasticTransform):
         self.config = config
         self.layout = layout
         self.num_envs = num_envs
+        self._draws = [(layout.columns[name], draw, _LOWEST.get(name, 0.0)) for name, draw in config.draws.items()]
 
     def sample(self, rows: int) -> Tensor:
         """Draw parameters for so many robots, [rows, P]."""
+        draws = torch.rand(rows, len(self.layout.nominal), generator=self.generator)
         parameters = self.layout.nominal.repeat(rows, 1)
-        for name, draw in self.config.draws.items():
-            columns = self.layout.columns[name]
-            nominal = parameters[:, columns]
-            value = draw.sample(torch.rand(nominal.shape, generator=self.generator))
+        for columns, draw, lowest in self._draws:
+            value = draw.sample(draws[:, columns])
             if draw.operation == "scale":
-                value = nominal * value
+                value *= parameters[:, columns]
             elif draw.operation == "add":
-                value = nominal + value
-            if name in ("link_mass", "velocity_gain"):
-                value = value.clamp(min=1e-3)
-            elif name == "actuator_delay":
-                value = value.round().clamp(min=0)
-            elif name != "encoder_offset":
-                value = value.clamp(min=0)
-            parameters[:, columns] = value
+                value += parameters[:, columns]
+            parameters[:, columns] = value.clamp_(min=lowest)
+        delay = parameters[:, self.layout.columns["actuator_delay"]]
+        delay.round_()
         return parameters
 
     def _reset_env_preprocess(self, tensordict: TensorDictBase | None) -> TensorDictBase:

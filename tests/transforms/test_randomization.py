@@ -91,7 +91,7 @@ def draw(layout, rows=3000, seed=0, **draws):
 def test_each_column_is_drawn_from_its_distribution(layout, name, settings, distribution):
     values, nominal = draw(layout, **{name: settings})
     for column in range(values.shape[1]):
-        assert stats.kstest(values[:, column], distribution(nominal[column]).cdf).pvalue > 0.01
+        assert stats.kstest(values[:, column], distribution(nominal[column]).cdf).pvalue > 1e-3
         for other in range(column):
             assert abs(stats.spearmanr(values[:, column], values[:, other]).statistic) < 0.06
 
@@ -106,7 +106,7 @@ def test_delays_are_whole_steps_up_to_the_longest(layout):
     values, _ = draw(layout, actuator_delay=uniform(0.0, 3.0))
     steps, counts = np.unique(values, return_counts=True)
     assert steps.tolist() == [0, 1, 2, 3]
-    assert stats.chisquare(counts, np.array([1, 2, 2, 1]) / 6 * len(values)).pvalue > 0.01
+    assert stats.chisquare(counts, np.array([1, 2, 2, 1]) / 6 * len(values)).pvalue > 1e-3
     assert config(actuator_delay=uniform(0.0, 3.0)).max_delay == 3
     normal_delay = config(actuator_delay=normal(1.0, 0.5))
     values, _ = draw(layout, rows=20000, actuator_delay=normal(1.0, 0.5))
