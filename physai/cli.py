@@ -41,7 +41,7 @@ def overrides() -> list[str]:
 
 
 class guard:  # noqa: N801
-    """Context in which a UserError ends the program with one line and exit code 2."""
+    """Context in which a UserError ends the program with one line and exit code 2, and Ctrl-C with 130."""
 
     def __enter__(self) -> None:
         pass
@@ -50,6 +50,8 @@ class guard:  # noqa: N801
         if isinstance(error, UserError):
             print(f"error: {error}", file=sys.stderr)
             sys.exit(2)
+        if isinstance(error, KeyboardInterrupt):
+            sys.exit(130)
 
 
 def _check_all(name: str, check: Callable[[DictConfig], object], given: list[str], sweep: bool) -> list[str]:

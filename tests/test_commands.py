@@ -73,7 +73,7 @@ BAD_TRAINING = {
         ["collector.frames_per_batch=0"],
         "collector.frames_per_batch: input should be greater than 0",
     ),
-    "uneven batch": (["collector.frames_per_batch=2000"], "must be a multiple of collector.num_envs (128)"),
+    "uneven batch": (["collector.frames_per_batch=2000"], "must be a multiple of collector.num_envs (256)"),
     "minibatch too large": (["algo.buffer.batch_size=5000"], "a minibatch of 5000 is larger than a batch"),
     "negative rate": (["algo.optimizer.lr=-1"], "Invalid learning rate: -1"),
     "unknown input": (

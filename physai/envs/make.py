@@ -66,7 +66,7 @@ class TransformedRobotEnv(TransformedEnv):
         if done.any():
             fresh = self._reset(TensorDict({"_reset": done}, self.batch_size))
             # Sensors answer anew in every row; those that go on keep what they have seen.
-            carried.update({key: torch.where(done, fresh.get(key), carried.get(key)) for key in fresh.keys()})
+            carried.update({key: torch.where(done, value, carried.get(key)) for key, value in fresh.items()})
         return tensordict, carried
 
     def set_seed(self, seed: int | None = None, static_seed: bool = False) -> int | None:

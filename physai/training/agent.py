@@ -1,6 +1,7 @@
 """The parts of a run, built from its config; and the trained part of them, read back from a file."""
 
 import hashlib
+import logging
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,8 @@ from physai.policies import input_size
 from physai.seeding import derive
 from physai.training.config import TrainConfig
 from physai.transforms import RandomizationConfig
+
+logging.getLogger("torchrl").setLevel(logging.WARNING)  # at INFO it reports every storage that it allocates
 
 
 @dataclass

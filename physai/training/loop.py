@@ -4,7 +4,7 @@ import contextlib
 import os
 import signal
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import FrameType
@@ -46,8 +46,14 @@ class Interrupted(Exception):  # noqa: N818
         self.exit_code = 128 + signal_number
 
 
-def train(config: TrainConfig, run_dir: Path, resume: bool) -> tuple[Agent, Clock]:
+def train(config: TrainConfig, run_dir: Path, resume: bool, stop: Sequence[int] = ()) -> tuple[Agent, Clock]:
     """Train until ``total_frames``, or go on from the last checkpoint in ``run_dir``.
+
+    Args:
+        config: The run.
+        run_dir: Where checkpoints and logs go.
+        resume: Whether to go on.
+        stop: From ``stop_signals``; when it fills, the iteration is finished and saved.
 
     Returns:
         The trained agent, to be closed by the caller, and the clock at the end.
@@ -67,7 +73,7 @@ def train(config: TrainConfig, run_dir: Path, resume: bool) -> tuple[Agent, Cloc
     try:
         if not clock.frames:
             _save(agent, clock, log, folder)  # a kill from here on loses nothing
-        with progress, _stop_signals() as stop:
+        with progress:
             _loop(config, agent, judge, clock, log, folder, progress, stop)
         if stop:
             raise Interrupted(stop[0])
@@ -92,7 +98,7 @@ def _loop(
     log: RunLog,
     folder: checkpoint.CheckpointFolder,
     progress: Progress,
-    stop: list[int],
+    stop: Sequence[int],
 ) -> None:
     batches = iter(agent.collector)
     while clock.frames < config.total_frames and not stop:
@@ -186,7 +192,7 @@ def _keep_evidence(error: NonFiniteError, clock: Clock, run_dir: Path, folder: c
 
 
 @contextlib.contextmanager
-def _stop_signals() -> Iterator[list[int]]:
+def stop_signals() -> Iterator[list[int]]:
     """Collect SIGINT and SIGTERM instead of dying by them; a second one is obeyed at once."""
     received: list[int] = []
 

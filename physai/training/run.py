@@ -19,7 +19,7 @@ from physai.training import checkpoint
 from physai.training.agent import Agent, load_policy_state, make_actor, make_evaluation_env
 from physai.training.config import TrainConfig
 from physai.training.evaluation import MAX_ROBOTS, Evaluation, evaluate
-from physai.training.loop import Clock, train
+from physai.training.loop import Clock, Interrupted, stop_signals, train
 from physai.transforms import RandomizationConfig
 
 FINAL_SEED = derive(0, "final evaluation goals")
@@ -52,14 +52,20 @@ def run_training(config: TrainConfig, run_dir: Path, resume: bool = False) -> di
         summary = json.loads(done.read_text())
         print_summary(summary, f"{run_dir}")
         return summary
-    agent, clock = train(config, run_dir, resume)
-    try:
-        result = TrainedPolicy(run_dir, "best").evaluate(config.evaluation.episodes)
-        summary = _summary(config, agent, clock, result)
-    finally:
-        agent.close()
-    plot_runs([run_dir], run_dir / "training.png")
-    checkpoint.write(done, json.dumps(summary, indent=2).encode())
+    with stop_signals() as stop:
+        agent, clock = train(config, run_dir, resume, stop)
+        try:
+            result = TrainedPolicy(run_dir, "best").evaluate(config.evaluation.episodes)
+            summary = _summary(config, agent, clock, result)
+        finally:
+            agent.close()
+        checkpoint.write(done, json.dumps(summary, indent=2).encode())
+        try:
+            plot_runs([run_dir], run_dir / "training.png")
+        except UserError as error:
+            print(f"No training.png: {error}")
+    if stop:  # too late to matter for this run, but a sweep must end
+        raise Interrupted(stop[0])
     print_summary(summary, f"{config.env.name}: the best policy, on {len(result.success):,} goals it has never seen")
     print(f"Run folder: {run_dir}")
     return summary
