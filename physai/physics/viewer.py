@@ -66,7 +66,7 @@ class Viewer:
         plate = self._body_of(bullet.GEOM_BOX, (0.97, 0.97, 0.98, 1), halfExtents=half)
         bullet.resetBasePositionAndOrientation(plate, (0, 0, floor - 0.005), (0, 0, 0, 1), self._client)
         target = (0, 0, 0.42 * height if upright else -0.03)
-        distance, pitch = (2.2 * reach, -25) if upright else (2.0 * reach, -58)
+        distance, pitch = (2.2 * reach, -25) if upright else (2.5 * reach, -58)
         self._view = bullet.computeViewMatrixFromYawPitchRoll(target, distance, 40, pitch, 0, 2)
         self._projection = bullet.computeProjectionMatrixFOV(40, width / image_height, 0.05, 10)
         if window:
