@@ -1,5 +1,6 @@
 """What all commands share: overrides are checked before Hydra creates anything, and a user's error is one line."""
 
+import contextlib
 import itertools
 import os
 import sys
@@ -13,6 +14,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import OverrideParseException
 from hydra.types import RunMode
 from omegaconf import DictConfig, open_dict
+from omegaconf.errors import OmegaConfBaseException
 
 from physai.config import compose, conf_dir
 from physai.errors import UserError
@@ -41,7 +43,7 @@ def overrides() -> list[str]:
 
 
 class guard:  # noqa: N801
-    """Context in which a UserError ends the program with one line and exit code 2, and Ctrl-C with 130."""
+    """Context in which what a user or a disk does wrong ends in one line and exit code 2, and Ctrl-C in 130."""
 
     def __enter__(self) -> None:
         pass
@@ -49,6 +51,9 @@ class guard:  # noqa: N801
     def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
         if isinstance(error, UserError):
             print(f"error: {error}", file=sys.stderr)
+            sys.exit(2)
+        if isinstance(error, OSError):
+            print(f"error: {error.filename or 'the disk'}: {error.strerror or error}", file=sys.stderr)
             sys.exit(2)
         if isinstance(error, KeyboardInterrupt):
             sys.exit(130)
@@ -58,15 +63,19 @@ def _check_all(name: str, check: Callable[[DictConfig], object], given: list[str
     """Check every job to come; return further overrides that pin down what Hydra would choose anew."""
     for one in _combinations(given) if sweep else [given]:
         config = compose(name, one, hydra=True)
-        folder = config.hydra.sweep.dir if sweep else config.hydra.run.dir
+        try:
+            folder = str(config.hydra.sweep.dir if sweep else config.hydra.run.dir)
+        except OmegaConfBaseException as error:
+            raise UserError(" ".join(str(error).split())) from None
         with open_dict(config):
             del config["hydra"]
         check(config)
     key = "hydra.sweep.dir" if sweep else "hydra.run.dir"
     if folder == ".":
         return []
-    if not sweep and (Path(folder) / ".hydra").exists():
-        raise UserError(f"{folder} holds a run already: go on with resume={folder}, or choose another hydra.run.dir")
+    if any(Path(folder).glob("*/.hydra" if sweep else ".hydra")):
+        way_out = f"choose another {key}" if sweep else f"go on with resume={folder}, or choose another {key}"
+        raise UserError(f"{folder} holds a run already: {way_out}")
     try:
         os.makedirs(folder, exist_ok=True)
     except OSError as error:
@@ -104,7 +113,8 @@ def _guarded(job: Job) -> Callable[[DictConfig], object]:
             return job(config, folder)
         except Exception as error:
             # A sweep goes on without the job that failed; its report names it.
-            (folder / "error.txt").write_text(f"{error}\n\n{traceback.format_exc()}")
+            with contextlib.suppress(OSError):
+                (folder / "error.txt").write_text(f"{error}\n\n{traceback.format_exc()}")
             print(f"error: {error}", file=sys.stderr)
             return None
 

@@ -40,6 +40,7 @@ def _whole(value: Any) -> Any:
     return int(value) if isinstance(value, float) and value.is_integer() else value
 
 
+Seed = Annotated[int, Field(ge=0, lt=2**32)]
 Count = Annotated[int, BeforeValidator(_whole), Field(gt=0)]
 PositiveFloat = Annotated[float, Field(gt=0)]
 NonNegativeFloat = Annotated[float, Field(ge=0)]
@@ -85,6 +86,8 @@ def compose(name: str, overrides: Iterable[str] = (), hydra: bool = False) -> Di
         except OverrideParseException as error:
             raise UserError(f"'{error.override}' is not an override such as key=value") from None
         except (HydraException, OmegaConfBaseException) as error:
+            if exists := re.search(r"already at '([^']+)'", str(error)):
+                raise UserError(f"'{exists[1]}' exists already: change it without the +") from None
             match = re.search(r"Could not (?:override|append to config|delete from config)[^']*'([^'=]+)", str(error))
             if match is None:
                 match = re.search(r"Key '([^']+)'", str(error))
@@ -150,7 +153,8 @@ def _check_target(node: dict[str, Any], path: str = "") -> dict[str, Any]:
         raise ValueError(f"{path}: a _target_ is needed, such as torch.optim.Adam")
     target = _import(name, path)
     hints, is_open = _parameters(target)
-    for key, value in node.items():
+    node = dict(node)
+    for key, value in list(node.items()):
         if key in ("_target_", "_partial_"):
             continue
         if key not in hints and not is_open:
@@ -158,9 +162,9 @@ def _check_target(node: dict[str, Any], path: str = "") -> dict[str, Any]:
                 f": unknown key '{path.lstrip('.')}{'.' if path else ''}{key}' of {name}{nearest(key, hints)}"
             )
         if isinstance(value, Mapping) and "_target_" in value:
-            _check_target(dict(value), f"{path}.{key}")
+            node[key] = _check_target(dict(value), f"{path}.{key}")
         else:
-            _check_value(hints.get(key, Any), value, f"{path}.{key}")
+            node[key] = _check_value(hints.get(key, Any), value, f"{path}.{key}")
     return node
 
 
@@ -209,16 +213,18 @@ def _parameters(target: Any) -> tuple[dict[str, Any], bool]:
     return hints, not inspect.isclass(target)
 
 
-def _check_value(hint: Any, value: Any, path: str) -> None:
+def _check_value(hint: Any, value: Any, path: str) -> Any:
+    """Return the value as its type wants it, so that 1e3 is a count where a count is wanted."""
     try:
         adapter = TypeAdapter(hint, config=ConfigDict(arbitrary_types_allowed=True))
     except (PydanticSchemaGenerationError, PydanticUndefinedAnnotation, TypeError):
-        return
+        return value
     try:
-        adapter.validate_python(value)
+        checked = adapter.validate_python(value)
     except ValidationError as error:
         message = error.errors()[0]["msg"]
         raise ValueError(f"{path}: {message[0].lower()}{message[1:]}, got {value!r}") from None
+    return checked if isinstance(checked, int | float | list) else value
 
 
 Target = Annotated[dict[str, Any], AfterValidator(_check_target)]

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 from omegaconf import DictConfig
 
 from physai import cli
-from physai.config import Config, Count, validate
+from physai.config import Config, Count, Seed, validate
 
 if TYPE_CHECKING:
     from physai.training.run import TrainedPolicy
@@ -35,7 +35,7 @@ class EvaluateConfig(PolicyChoice):
     """``conf/evaluate.yaml``."""
 
     episodes: Count
-    seed: int | None
+    seed: Seed | None
 
 
 def _check(node: DictConfig) -> None:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Literal
 from omegaconf import DictConfig
 
 from physai import cli
-from physai.config import Count, validate
+from physai.config import Count, Seed, validate
 from physai.errors import UserError
 from physai.evaluate import PolicyChoice
 
@@ -21,7 +21,7 @@ class PlayConfig(PolicyChoice):
     """``conf/play.yaml``."""
 
     goals: Count
-    seed: int
+    seed: Seed
     render: Literal["video", "human"]
     output: str | None
 

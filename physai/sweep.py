@@ -9,6 +9,8 @@ from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 from rich.table import Table
 
+from physai.errors import UserError
+
 
 class SweepReport(Callback):
     """Hydra callback; exits with code 1 if a run of the sweep failed."""
@@ -31,8 +33,11 @@ class SweepReport(Callback):
         Console().print(table)
         finished = [run for run, summary in summaries.items() if summary]
         if finished:
-            plot_runs(finished, folder / "training.png")
-            print(f"Curves of all runs: {folder / 'training.png'}")
+            try:  # Hydra would turn an error here into a warning, and forget the failures below
+                plot_runs(finished, folder / "training.png")
+                print(f"Curves of all runs: {folder / 'training.png'}")
+            except (UserError, OSError) as error:
+                print(f"error: no plot: {error}", file=sys.stderr)
         failed = [run for run in runs if run not in finished]
         for run in failed:
             print(f"error: {run}: {_reason(run)}", file=sys.stderr)

@@ -4,7 +4,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 from physai import cli
 from physai.errors import UserError
@@ -52,8 +52,7 @@ def _resume(run_dir: Path, given: list[str]) -> None:
         raise UserError("resume continues one run; it cannot be swept over")
     config = load_config(run_dir)
     if given:
-        saved = (run_dir / ".hydra" / "overrides.yaml").read_text()
-        overrides = [line.removeprefix("- ").strip("'\"") for line in saved.splitlines() if line.startswith("- ")]
+        overrides = list(OmegaConf.load(run_dir / ".hydra" / "overrides.yaml"))
         wanted = _config(compose("train", [*overrides, *given]))
         difference = _first_difference(config.model_dump(), wanted.model_dump())
         if difference:

@@ -75,6 +75,9 @@ BAD_TRAINING = {
     ),
     "uneven batch": (["collector.frames_per_batch=2000"], "must be a multiple of collector.num_envs (256)"),
     "minibatch too large": (["algo.buffer.batch_size=5000"], "a minibatch of 5000 is larger than a batch"),
+    "zero minibatch": (["algo.buffer.batch_size=0"], "algo.buffer.batch_size: a whole number above 0 is needed, got 0"),
+    "existing key with +": (["+total_frames=5"], "'total_frames' exists already: change it without the +"),
+    "removed group": (["~env"], "env"),
     "negative rate": (["algo.optimizer.lr=-1"], "Invalid learning rate: -1"),
     "unknown input": (
         ["policy.actor.in_keys=[observatio]"],
@@ -179,6 +182,23 @@ def test_a_second_run_does_not_overwrite_the_first(run, copied):
     assert code == 2
     assert "holds a run already: go on with resume=run" in error
     assert (copied / "summary.json").read_bytes() == before
+
+
+def test_resume_refuses_a_run_whose_checkpoints_are_gone(run, copied):
+    (copied / "summary.json").unlink()
+    shutil.rmtree(copied / "checkpoints")
+    before = (copied / "metrics.csv").read_bytes()
+    code, _, error = run("train", "resume=run")
+    assert code == 2
+    assert "its checkpoints are gone" in error
+    assert (copied / "metrics.csv").read_bytes() == before
+
+
+def test_a_second_sweep_does_not_overwrite_the_first(run, copied, tmp_path):
+    shutil.copytree(copied, tmp_path / "sweep" / "0")
+    code, _, error = run("train", "-m", *SMALL, "seed=0,1", "hydra.sweep.dir=sweep")
+    assert code == 2
+    assert "sweep holds a run already: choose another hydra.sweep.dir" in error
 
 
 def test_evaluate_says_how_sure_it_is_and_which_randomization_it_used(run, copied):

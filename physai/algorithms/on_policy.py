@@ -55,9 +55,12 @@ class OnPolicy:
         epochs: Count,
         max_grad_norm: PositiveFloat,
     ) -> None:
-        if (buffer.batch_size or 0) > frames_per_batch:
+        size = buffer.batch_size
+        if not isinstance(size, int) or size < 1:
+            raise UserError(f"algo.buffer.batch_size: a whole number above 0 is needed, got {size!r}")
+        if size > frames_per_batch:
             raise UserError(
-                f"algo.buffer.batch_size: a minibatch of {buffer.batch_size} is larger than a batch, "
+                f"algo.buffer.batch_size: a minibatch of {size} is larger than a batch, "
                 f"collector.frames_per_batch={frames_per_batch}"
             )
         self.loss: Any = loss(actor_network=actor, critic_network=critic)

@@ -1,6 +1,7 @@
 """PyBullet as a batch of robots: several small worlds in one process, each a DIRECT client of its own."""
 
 import tempfile
+import weakref
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -45,13 +46,14 @@ class PyBulletPhysics:
         self.substeps = substeps
         self._spec = spec
         self._worlds: list[_World] = []
+        self._finalizer = weakref.finalize(self, _disconnect, self._worlds)
         try:
             with tempfile.TemporaryDirectory(prefix="physai-") as folder:
                 model = _model_for_physics(spec, Path(folder))
                 for first in range(0, num_robots, ROBOTS_PER_WORLD):
                     robots = min(ROBOTS_PER_WORLD, num_robots - first)
                     self._worlds.append(_make_world(spec, model, robots, control_dt / substeps))
-        except UserError:
+        except BaseException:
             self.close()
             raise
         joints, links, masses = _indices(self._worlds[0], spec)
@@ -167,8 +169,12 @@ class PyBulletPhysics:
 
     def close(self) -> None:
         """Disconnect all clients."""
-        while self._worlds:
-            bullet.disconnect(self._worlds.pop().client)
+        _disconnect(self._worlds)
+
+
+def _disconnect(worlds: list[_World]) -> None:
+    while worlds:
+        bullet.disconnect(worlds.pop().client)
 
 
 def _model_for_physics(spec: RobotSpec, folder: Path) -> Path:

@@ -91,8 +91,11 @@ def make_actor(config: TrainConfig, env: TransformedRobotEnv) -> TensorDictModul
 
 def load_policy_state(actor: TensorDictModuleBase, env: TransformedRobotEnv, state: dict[str, Any]) -> None:
     """Give an actor its weights and an env its normalization statistics."""
-    actor.load_state_dict(state["actor"])
-    env.normalization.load_state_dict(state["normalization"])
+    try:
+        actor.load_state_dict(state["actor"])
+        env.normalization.load_state_dict(state["normalization"])
+    except (RuntimeError, KeyError, TypeError) as error:
+        raise UserError(f"the checkpoint does not fit the run's config: {str(error).splitlines()[0][:120]}") from None
 
 
 def make_evaluation_env(

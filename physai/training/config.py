@@ -1,11 +1,9 @@
 """Types and ranges of ``conf/train.yaml``; the values are there."""
 
-from typing import Annotated, Literal
-
-from pydantic import Field
+from typing import Literal
 
 from physai.collectors import CollectorConfig
-from physai.config import Config, Count, Target
+from physai.config import Config, Count, Seed, Target
 from physai.envs.make import NormalizationConfig
 from physai.envs.simulation import EnvConfig
 from physai.transforms import RandomizationConfig
@@ -46,7 +44,7 @@ class TrainConfig(Config):
     checkpoint: CheckpointConfig
     evaluation: EvaluationConfig
     logger: Target
-    seed: Annotated[int, Field(ge=0, lt=2**32)]
+    seed: Seed
     total_frames: Count
     device: Literal["cpu"]
     threads: Count

@@ -8,6 +8,8 @@ from typing import IO, Any
 
 from tensordict import TensorDictBase
 
+from physai.errors import UserError
+
 
 class CsvLog:
     """A CSV file that can go back to an earlier length, for a resumed run.
@@ -21,6 +23,8 @@ class CsvLog:
     def __init__(self, path: Path, columns: Sequence[str], length: int = 0) -> None:
         self.columns = columns
         if length:
+            if not path.is_file() or path.stat().st_size < length:
+                raise UserError(f"{path}: rows are missing that its run had written")
             os.truncate(path, length)
         self._file: IO[str] = open(path, "a" if length else "w", newline="")  # noqa: SIM115
         self._writer = csv.DictWriter(self._file, columns, restval="")

@@ -65,8 +65,27 @@ def train(config: TrainConfig, run_dir: Path, resume: bool, stop: Sequence[int] 
     agent = Agent.build(config)
     folder = checkpoint.CheckpointFolder(run_dir / "checkpoints", config.checkpoint.keep)
     clock, logged = Clock(), None
-    if resume and folder.paths():
-        clock, logged = _restore(agent, checkpoint.load(folder.find("last")))
+    try:
+        if resume and folder.paths():
+            clock, logged = _restore(agent, checkpoint.load(folder.find("last")))
+        elif (run_dir / "metrics.csv").exists():
+            raise UserError(f"{run_dir}: its checkpoints are gone; it cannot be resumed")
+        _run(config, run_dir, agent, clock, logged, folder, stop)
+    except BaseException:
+        agent.close()
+        raise
+    return agent, clock
+
+
+def _run(
+    config: TrainConfig,
+    run_dir: Path,
+    agent: Agent,
+    clock: Clock,
+    logged: dict[str, Any] | None,
+    folder: checkpoint.CheckpointFolder,
+    stop: Sequence[int],
+) -> None:
     judge = make_evaluation_env(config, config.evaluation.randomization, config.evaluation.goals, EVALUATION_SEED)
     log = RunLog(run_dir, make_logger(config, run_dir), logged)
     progress = Progress(config.total_frames, clock.frames)
@@ -76,6 +95,7 @@ def train(config: TrainConfig, run_dir: Path, resume: bool, stop: Sequence[int] 
         with progress:
             _loop(config, agent, judge, clock, log, folder, progress, stop)
         if stop:
+            _save(agent, clock, log, folder)
             raise Interrupted(stop[0])
     except NonFiniteError as error:
         raise UserError(_keep_evidence(error, clock, run_dir, folder)) from error
@@ -85,9 +105,9 @@ def train(config: TrainConfig, run_dir: Path, resume: bool, stop: Sequence[int] 
             f"cannot write to {run_dir}: {error.strerror or error}; last good checkpoint: {kept}"
         ) from error
     finally:
-        log.close()
         judge.close()
-    return agent, clock
+        with contextlib.suppress(OSError):  # a full disk refuses the last rows, too
+            log.close()
 
 
 def _loop(
@@ -127,7 +147,7 @@ def _loop(
             values |= {f"evaluation/{key}": value for key, value in result.items() if isinstance(value, float)}
         saving = time.perf_counter()
         log.metrics(clock.frames, clock.iteration, values)
-        if done or stop or _due(first_frame, clock.frames, config.checkpoint.every_frames):
+        if done or _due(first_frame, clock.frames, config.checkpoint.every_frames):
             _save(agent, clock, log, folder)
         clock.seconds += time.perf_counter() - saving
         progress.update(clock.frames, clock.frames / clock.seconds, values)
@@ -175,10 +195,13 @@ def _save(agent: Agent, clock: Clock, log: RunLog, folder: checkpoint.Checkpoint
 
 
 def _restore(agent: Agent, content: dict[str, Any]) -> tuple[Clock, dict[str, Any]]:
-    agent.algorithm.set_state(content["algorithm"])
-    agent.collector.set_state(content["collector"])
-    torch.set_rng_state(content["random"])
-    return Clock(**content["clock"]), content["log"]
+    try:
+        agent.algorithm.set_state(content["algorithm"])
+        agent.collector.set_state(content["collector"])
+        torch.set_rng_state(content["random"])
+        return Clock(**content["clock"]), content["log"]
+    except (RuntimeError, KeyError, TypeError, ValueError) as error:
+        raise UserError(f"the checkpoint does not fit the run's config: {str(error).splitlines()[0][:120]}") from None
 
 
 def _keep_evidence(error: NonFiniteError, clock: Clock, run_dir: Path, folder: checkpoint.CheckpointFolder) -> str:

@@ -1,3 +1,5 @@
+from pathlib import Path
+
 import pytest
 import torch
 
@@ -51,3 +53,20 @@ def test_a_batch_must_be_whole_steps_of_all_robots():
     with pytest.raises(UserError, match="multiple of"):
         make_collector(CollectorConfig(num_envs=16, frames_per_batch=100), env, None, 1000)
     env.close()
+
+
+def resident_megabytes():
+    with open("/proc/self/statm") as file:
+        return int(file.read().split()[1]) * 4096 / 2**20
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="needs /proc")
+def test_memory_stays_flat_while_frames_go_by():
+    source = collector(frames=1600, total=240_000)
+    sizes = []
+    for batch in source:
+        source.env.normalization.update(batch["observation"])
+        sizes.append(resident_megabytes())
+    source.shutdown()
+    assert max(sizes[75:]) - sizes[50] < 5  # 1 kB kept per 15 frames would show
