@@ -78,6 +78,8 @@ BAD_TRAINING = {
     "zero minibatch": (["algo.buffer.batch_size=0"], "algo.buffer.batch_size: a whole number above 0 is needed, got 0"),
     "existing key with +": (["+total_frames=5"], "'total_frames' exists already: change it without the +"),
     "removed group": (["~env"], "env"),
+    "clip out of range": (["algo.loss.clip_epsilon=-1"], "algo.loss.clip_epsilon: must be between 0 and 1, got -1"),
+    "discount out of range": (["algo.advantage.gamma=2"], "algo.advantage.gamma: must be between 0 and 1, got 2"),
     "negative rate": (["algo.optimizer.lr=-1"], "Invalid learning rate: -1"),
     "unknown input": (
         ["policy.actor.in_keys=[observatio]"],
@@ -218,7 +220,7 @@ def test_evaluate_says_how_sure_it_is_and_which_randomization_it_used(run, copie
         ("evaluate", ["run=run", "checkpoint=7"], "no checkpoint '7'; there are: best"),
         ("evaluate", ["run=run", "episodes=0"], "episodes: input should be greater than 0"),
         ("evaluate", ["run=run", "randomization=stron"], "did you mean 'strong'?"),
-        ("evaluate", [], "run"),
+        ("evaluate", [], "run=... is required"),
         ("play", ["run=run", "output=arm.avi"], "must end in .mp4 or .gif"),
         ("play", ["run=run", "render=windw"], "render: input should be 'video' or 'human'"),
         ("plot", ["runs=[nowhere]"], "nowhere: no run there"),

@@ -23,6 +23,16 @@ class NonFiniteError(ArithmeticError):
         self.batch = batch
 
 
+# What TorchRL takes at any value, and no training survives.
+_RANGES = {
+    "gamma": (0.0, 1.0),
+    "lmbda": (0.0, 1.0),
+    "clip_epsilon": (0.0, 1.0),
+    "critic_coeff": (0.0, float("inf")),
+    "entropy_coeff": (0.0, float("inf")),
+}
+
+
 class OnPolicy:
     """An on-policy actor-critic algorithm, put together from TorchRL parts (``conf/algo/ppo.yaml``).
 
@@ -65,6 +75,11 @@ class OnPolicy:
             )
         self.loss: Any = loss(actor_network=actor, critic_network=critic)
         self.advantage = advantage(value_network=critic)
+        for where, module in (("loss", self.loss), ("advantage", self.advantage)):
+            for name, (low, high) in _RANGES.items():
+                value = getattr(module, name, None)
+                if value is not None and not low <= float(value) <= high:
+                    raise UserError(f"algo.{where}.{name}: must be between {low:g} and {high:g}, got {float(value):g}")
         self.buffer = buffer
         self.optimizer = optimizer(self.loss.parameters())
         self.scheduler = scheduler(self.optimizer) if scheduler is not None else None

@@ -54,6 +54,7 @@ def run_training(config: TrainConfig, run_dir: Path, resume: bool = False) -> di
         return summary
     with stop_signals() as stop:
         agent, clock = train(config, run_dir, resume, stop)
+        print(f"Judging the best policy on {config.evaluation.episodes:,} goals it has never seen ...", flush=True)
         try:
             result = TrainedPolicy(run_dir, "best").evaluate(config.evaluation.episodes)
             summary = _summary(config, agent, clock, result)
