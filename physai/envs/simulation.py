@@ -34,7 +34,7 @@ class Simulation:
         seed: Seeds goals and start poses.
 
     Attributes:
-        observation: The task's module that makes what a policy sees.
+        observation: The task's module that makes what a policy sees, and knows the distance to the goal.
         joint_position, joint_velocity: True joint state, rad and rad/s, [N, n].
         goal: [N, 2], m.
         distance: To the goal, m, [N, 1].
@@ -110,7 +110,7 @@ class Simulation:
     def _read(self, joint_position: Any, joint_velocity: Any) -> None:
         self.joint_position = torch.from_numpy(joint_position).float()
         self.joint_velocity = torch.from_numpy(joint_velocity).float()
-        self.distance = self.task.distance(self.kinematics(self.joint_position), self.goal)
+        self.distance = self.observation.distance(self.joint_position, self.goal)
 
     def state(self) -> dict[str, Tensor]:
         """Return everything that ``set_state`` of an equal simulation needs to go on bit for bit."""
@@ -136,7 +136,7 @@ class Simulation:
     def viewer(self, window: bool = False) -> Viewer:
         """Make a viewer for these robots; it has a world of its own."""
         home = torch.from_numpy(self.spec.home).float()
-        height = float(self.kinematics(home)[2])
+        height = float(self.kinematics(home[None])[0, 2])
         return Viewer(self.spec, height, self.kinematics.reach, self.task.tolerance, window)
 
     def close(self) -> None:

@@ -16,10 +16,9 @@ class ReachObservation(nn.Module):
     """From what a robot senses to what its policy sees; scriptable, and part of the exported policy.
 
     The observation is ``[q, qd, ee_x, ee_y, goal_x, goal_y]``. Features say the same in terms that a small network
-    learns from
-    quickly: sine and cosine of the joints, the error e = goal - ee, and Jᵀe, the direction in joint space that
-    shortens it fastest (Khatib, 1987); errors appear once in units of the arm and once, saturated, in units of the
-    tolerance.
+    learns from quickly: sine and cosine of the joints, the error e = goal - ee, and Jᵀe, the direction in joint space
+    that shortens it fastest (Khatib, 1987); both errors appear once in units of the arm and once, saturated, in units
+    of the tolerance.
 
     Args:
         kinematics: The robot's forward kinematics.
@@ -29,32 +28,41 @@ class ReachObservation(nn.Module):
     def __init__(self, kinematics: ForwardKinematics, tolerance: float) -> None:
         super().__init__()
         self.kinematics = kinematics
-        self.length = kinematics.reach
-        self.tolerance = tolerance
+        length, joints = kinematics.reach, kinematics.constant.shape[0]
+        self.coarse: Tensor
+        self.fine: Tensor
+        # Scales of [e, Jᵀe]: buffers, for TorchScript turns a number into a tensor again at every call.
+        self.register_buffer("coarse", torch.tensor([2.0 / length] * 2 + [0.25 / (length * tolerance)] * joints))
+        self.register_buffer("fine", torch.tensor([0.5 / tolerance] * 2 + [1.0 / (length * tolerance)] * joints))
 
     def forward(self, joint_position: Tensor, joint_velocity: Tensor, goal: Tensor) -> tuple[Tensor, Tensor]:
-        """Map positions [..., n] rad, velocities [..., n] rad/s and goals [..., 2] m to observation and features.
+        """Map positions [N, n] rad, velocities [N, n] rad/s and goals [N, 2] m to observation and features.
 
         Returns:
-            Observation [..., 2n + 4] and features [..., 4n + 4].
+            Observation [N, 2n + 4] and features [N, 4n + 4].
         """
-        position_and_slopes = self.kinematics.linearize(joint_position)[..., :2]
-        end_effector, jacobian = position_and_slopes[..., 0, :], position_and_slopes[..., 1:, :]
+        plane = self.kinematics.linearize(joint_position).narrow(1, 0, 2)
+        jacobian, position = plane.split([joint_position.shape[1], 1], dim=2)
+        end_effector = position.squeeze(2)
         error = goal - end_effector
-        descent = (jacobian * error[..., None, :]).sum(-1) / (self.length * self.tolerance)
-        observation = torch.cat([joint_position, joint_velocity, end_effector, goal], dim=-1)
+        errors = torch.cat([error, torch.bmm(error.unsqueeze(1), jacobian).squeeze(1)], dim=1)
+        observation = torch.cat([joint_position, joint_velocity, end_effector, goal], dim=1)
         features = torch.cat(
             [
                 torch.sin(joint_position),
                 torch.cos(joint_position),
-                2.0 * error / self.length,
-                torch.tanh(0.5 * error / self.tolerance),
-                0.25 * descent,
-                torch.tanh(descent),
+                errors * self.coarse,
+                torch.tanh(errors * self.fine),
             ],
-            dim=-1,
+            dim=1,
         )
         return observation, features
+
+    @torch.jit.export
+    def distance(self, joint_position: Tensor, goal: Tensor) -> Tensor:
+        """Distance of the end effector to the goal in the plane, m: [N, n] rad and [N, 2] m to [N, 1]."""
+        end_effector = self.kinematics(joint_position).narrow(1, 0, 2)
+        return torch.linalg.vector_norm(end_effector - goal, dim=1, keepdim=True)
 
 
 class Reach:
@@ -125,10 +133,6 @@ class Reach:
             torch.cat([lower - 0.5, -velocity, -end_effector, -goal]).float(),
             torch.cat([upper + 0.5, velocity, end_effector, goal]).float(),
         )
-
-    def distance(self, end_effector: Tensor, goal: Tensor) -> Tensor:
-        """Distance in the plane, m: [N, 3] and [N, 2] to [N, 1]."""
-        return torch.linalg.vector_norm(end_effector[:, :2] - goal, dim=-1, keepdim=True)
 
     def success(self, distance: Tensor) -> Tensor:
         """Whether the goal is reached, [N, 1] to [N, 1]."""

@@ -76,10 +76,13 @@ def test_starts_are_uniform_around_home_and_stay_within_the_joint_limits(any_env
     assert (starts <= spec.position_limit[:, 1]).all()
 
 
-def test_distance_counts_in_the_plane_only(task):
-    end_effector = torch.tensor([[0.3, 0.4, 9.0], [0.0, 0.0, -1.0]])
-    goal = torch.tensor([[0.0, 0.0], [-0.6, 0.8]])
-    torch.testing.assert_close(task.distance(end_effector, goal), torch.tensor([[0.5], [1.0]]))
+def test_distance_counts_in_the_plane_only(task, kuka_reacher):
+    kinematics = ForwardKinematics(RobotSpec.from_config(kuka_reacher.robot))
+    q = torch.tensor([[0.0, 0.5], [1.0, -0.8]])
+    end_effector = kinematics(q)
+    assert (end_effector[:, 2] > 0.5).all()
+    goal = end_effector[:, :2] + torch.tensor([[0.3, 0.4], [-0.6, 0.8]])
+    torch.testing.assert_close(task.observation(kinematics).distance(q, goal), torch.tensor([[0.5], [1.0]]))
 
 
 def test_reward_and_success_are_the_numbers_of_the_contract(task):
