@@ -76,9 +76,23 @@ def _run(config: "TrainConfig", run_dir: Path, resume: bool) -> None:
 
     try:
         run_training(config, run_dir, resume)
+        _export(run_dir)
     except Interrupted as stopped:
         print(f"\nStopped by {stopped}; everything is saved. Go on with:\n  python -m physai.train resume={run_dir}")
         sys.exit(stopped.exit_code)
+
+
+def _export(run_dir: Path) -> None:
+    from physai.artifact import FILES, onnx
+    from physai.export import export
+
+    lacking = onnx.missing()
+    formats = ["torchscript"] if lacking else ["torchscript", "onnx"]
+    if all((run_dir / FILES[name]).exists() for name in formats):  # a complete run was resumed
+        return
+    export(run_dir, "best", formats)
+    if lacking:
+        print(f"No {FILES['onnx']}: it needs {', '.join(lacking)} (pip install 'physai[onnx]')")
 
 
 if __name__ == "__main__":

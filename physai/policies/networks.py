@@ -82,6 +82,10 @@ class GaussianActor(TensorDictModuleBase):
         self.network = mlp(in_features, hidden_sizes, action_size, activation, last_gain=0.01)  # start near standstill
         self.log_std = nn.Parameter(torch.full((action_size,), initial_std).log())
 
+    def deterministic(self) -> nn.Module:
+        """What acts without exploration, scriptable: ``in_keys`` side by side, [N, in_features], to actions [N, n]."""
+        return nn.Sequential(*self.network, nn.Tanh())
+
     def mean(self, tensordict: TensorDictBase) -> Tensor:
         """Mean of the latent action, [.., n]."""
         return self.network(_inputs(tensordict, self.in_keys))

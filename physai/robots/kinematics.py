@@ -26,7 +26,7 @@ class ForwardKinematics(nn.Module):
     def __init__(self, spec: RobotSpec) -> None:
         super().__init__()
         constant, cosine, sine = (np.zeros((len(spec.joints), 8, 4)) for _ in range(3))
-        offsets = []
+        offsets: list[np.ndarray] = []
         fixed = np.eye(4)
         for joint in spec.chain:
             fixed = fixed @ (np.eye(4) if joint.origin is None else joint.origin)

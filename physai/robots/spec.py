@@ -30,6 +30,7 @@ class RobotSpec:
         name: The robot's name.
         urdf: Path of the URDF file.
         joints: Names of the n controlled joints.
+        base: Name of the link in whose frame positions are given.
         end_effector: Name of the link that reaches.
         home: Rest pose, rad, [n].
         position_limit: Lower and upper limit, rad, [n, 2]; infinite for continuous joints.
@@ -45,6 +46,7 @@ class RobotSpec:
     name: str
     urdf: Path
     joints: tuple[str, ...]
+    base: str
     end_effector: str
     home: np.ndarray
     position_limit: np.ndarray
@@ -100,6 +102,7 @@ class RobotSpec:
             name=config.name,
             urdf=path,
             joints=tuple(config.joints),
+            base=chain[0].parent,
             end_effector=config.end_effector,
             home=np.array(config.home, dtype=np.float64),
             position_limit=np.array([_position_limit(joint) for joint in joints]),

@@ -92,6 +92,11 @@ class Reach:
         self.max_steps = max_steps
         self.start_spread = start_spread
 
+    @property
+    def goal_region(self) -> tuple[float, float]:
+        """Nearest and farthest goal from the origin of the base frame, m."""
+        return self.goal_radius[0], self.goal_radius[1]
+
     def check(self, spec: RobotSpec, kinematics: ForwardKinematics) -> None:
         """Raise a UserError if this robot cannot do the task."""
         inner, outer = self.goal_radius

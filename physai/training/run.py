@@ -80,6 +80,9 @@ class TrainedPolicy:
         which: ``best``, ``last``, or a number of frames.
         randomization: How robots differ; None takes the run's own evaluation.
 
+    Attributes:
+        frames: How many it had seen.
+
     Raises:
         UserError: If there is no such run or checkpoint, or it is damaged.
     """
@@ -88,6 +91,7 @@ class TrainedPolicy:
         self.config = load_config(run_dir)
         self.randomization = randomization or self.config.evaluation.randomization
         self._state = checkpoint.load(checkpoint.CheckpointFolder(run_dir / "checkpoints", 1).find(which))
+        self.frames = int(self._state["frames"])
 
     def deploy(self, num_envs: int, seed: int) -> tuple[TensorDictModuleBase, TransformedRobotEnv]:
         """Build the actor, and an env with the statistics that it was trained with."""
@@ -116,11 +120,12 @@ def _summary(config: TrainConfig, agent: Agent, clock: Clock, result: Evaluation
         "frames_per_second": round(clock.frames / clock.seconds, 1),
         "weights_sha256": agent.weights_sha256(),
         "seed": config.seed,
-        "git_commit": _git_commit(),
+        "git_commit": git_commit(),
     }
 
 
-def _git_commit() -> str | None:
+def git_commit() -> str | None:
+    """The commit of physai's checkout, if it is one."""
     command = ["git", "-C", str(Path(__file__).parent), "rev-parse", "HEAD"]
     try:
         return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()

@@ -2,9 +2,30 @@
 
 import torch
 from tensordict import TensorDictBase
-from torch import Tensor
+from torch import Tensor, nn
 from torchrl.data import Composite
 from torchrl.envs.transforms import Transform
+
+
+class Normalizer(nn.Module):
+    """``clamp((observation - loc) / scale)``; scriptable, and part of the exported policy.
+
+    Args:
+        size: Length of an observation.
+        clip: Bound of the result, in standard deviations.
+    """
+
+    def __init__(self, size: int, clip: float) -> None:
+        super().__init__()
+        self.clip = clip
+        self.loc: Tensor
+        self.scale: Tensor
+        self.register_buffer("loc", torch.zeros(size))
+        self.register_buffer("scale", torch.ones(size))
+
+    def forward(self, observation: Tensor) -> Tensor:
+        """Normalize observations [..., size]."""
+        return ((observation - self.loc) / self.scale).clamp(-self.clip, self.clip)
 
 
 class ObservationNormalization(Transform):
@@ -24,17 +45,13 @@ class ObservationNormalization(Transform):
     def __init__(self, size: int, eps: float, clip: float) -> None:
         super().__init__(in_keys=["observation"], out_keys=["normalized_observation"])
         self.eps = eps
-        self.clip = clip
+        self.normalizer = Normalizer(size, clip)
         self.count: Tensor
         self.mean: Tensor
         self.variance: Tensor
-        self.loc: Tensor
-        self.scale: Tensor
         self.register_buffer("count", torch.zeros((), dtype=torch.float64))
         self.register_buffer("mean", torch.zeros(size, dtype=torch.float64))
         self.register_buffer("variance", torch.ones(size, dtype=torch.float64))
-        self.register_buffer("loc", torch.zeros(size))
-        self.register_buffer("scale", torch.ones(size))
 
     @torch.no_grad()
     def update(self, observation: Tensor) -> None:
@@ -49,15 +66,11 @@ class ObservationNormalization(Transform):
             self.mean = self.mean + delta * share
             self.variance = self.variance * (1 - share) + variance * share + delta.square() * share * (1 - share)
         self.count = count
-        self.loc = self.mean.float()
-        self.scale = self.variance.sqrt().float().clamp(min=self.eps)
-
-    def normalize(self, observation: Tensor) -> Tensor:
-        """Normalize observations [..., size] with the statistics as they are."""
-        return ((observation - self.loc) / self.scale).clamp(-self.clip, self.clip)
+        self.normalizer.loc = self.mean.float()
+        self.normalizer.scale = self.variance.sqrt().float().clamp(min=self.eps)
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        return next_tensordict.set("normalized_observation", self.normalize(next_tensordict.get("observation")))
+        return next_tensordict.set("normalized_observation", self.normalizer(next_tensordict.get("observation")))
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         return self._step(tensordict, tensordict_reset)

@@ -20,7 +20,7 @@ def test_one_set_of_statistics_holds_for_a_whole_batch():
     source = collector()
     normalization = source.env.normalization
     for batch in source:
-        expected = normalization.normalize(batch["observation"])
+        expected = normalization.normalizer(batch["observation"])
         assert torch.equal(batch["normalized_observation"], expected)
         normalization.update(batch["observation"])
     source.shutdown()

@@ -31,8 +31,10 @@ def test_statistics_equal_numpy_s_over_uneven_batches_of_any_shape():
         rows = all_rows(seen[:count])
         np.testing.assert_allclose(transform.mean.numpy(), rows.mean(0), rtol=1e-9, atol=1e-9)
         np.testing.assert_allclose(transform.variance.numpy(), rows.var(0), rtol=1e-9, atol=1e-12)
-        np.testing.assert_allclose(transform.loc.numpy(), rows.mean(0), rtol=1e-5, atol=1e-5)
-        np.testing.assert_allclose(transform.scale.numpy(), np.maximum(rows.std(0), 1e-3), rtol=1e-5, atol=1e-5)
+        np.testing.assert_allclose(transform.normalizer.loc.numpy(), rows.mean(0), rtol=1e-5, atol=1e-5)
+        np.testing.assert_allclose(
+            transform.normalizer.scale.numpy(), np.maximum(rows.std(0), 1e-3), rtol=1e-5, atol=1e-5
+        )
         assert transform.count == len(rows)
 
 
@@ -44,8 +46,8 @@ def test_how_observations_are_cut_into_batches_does_not_matter(sizes, seed):
     for batch in seen:
         transform.update(batch)
     whole.update(torch.cat(seen))
-    torch.testing.assert_close(transform.loc, whole.loc, rtol=1e-6, atol=1e-6)
-    torch.testing.assert_close(transform.scale, whole.scale, rtol=1e-6, atol=1e-6)
+    torch.testing.assert_close(transform.normalizer.loc, whole.normalizer.loc, rtol=1e-6, atol=1e-6)
+    torch.testing.assert_close(transform.normalizer.scale, whole.normalizer.scale, rtol=1e-6, atol=1e-6)
 
 
 def test_normalized_is_the_clipped_distance_from_the_mean_in_standard_deviations():
@@ -54,7 +56,7 @@ def test_normalized_is_the_clipped_distance_from_the_mean_in_standard_deviations
     transform.update(seen)
     rows = all_rows([seen])
     expected = np.clip((rows - rows.mean(0)) / rows.std(0), -2.0, 2.0)
-    found = transform.normalize(seen)
+    found = transform.normalizer(seen)
     np.testing.assert_allclose(found.numpy(), expected, rtol=0, atol=2e-4)
     assert found.abs().max() == 2.0
     assert (found.abs() == 2.0).double().mean() == pytest.approx(0.0455, abs=0.02)
@@ -63,15 +65,15 @@ def test_normalized_is_the_clipped_distance_from_the_mean_in_standard_deviations
 def test_normalizing_changes_no_statistics_and_none_means_no_change():
     transform = normalization()
     (seen,) = batches([(50,)])
-    assert torch.equal(transform.normalize(seen), seen.clamp(-10, 10))
+    assert torch.equal(transform.normalizer(seen), seen.clamp(-10, 10))
     assert transform.count == 0
 
 
 def test_what_never_varies_is_divided_by_eps():
     transform = normalization(eps=0.01)
     transform.update(torch.full((30, 4), 2.5))
-    assert transform.scale.tolist() == pytest.approx([0.01] * 4)
-    torch.testing.assert_close(transform.normalize(torch.full((4,), 2.51)), torch.ones(4), rtol=1e-3, atol=0)
+    assert transform.normalizer.scale.tolist() == pytest.approx([0.01] * 4)
+    torch.testing.assert_close(transform.normalizer(torch.full((4,), 2.51)), torch.ones(4), rtol=1e-3, atol=0)
 
 
 def test_state_dict_carries_the_statistics():
@@ -81,6 +83,6 @@ def test_state_dict_carries_the_statistics():
     restored.load_state_dict(transform.state_dict())
     for each in (transform, restored):
         each.update(seen[1])
-    assert torch.equal(transform.loc, restored.loc)
-    assert torch.equal(transform.scale, restored.scale)
+    assert torch.equal(transform.normalizer.loc, restored.normalizer.loc)
+    assert torch.equal(transform.normalizer.scale, restored.normalizer.scale)
     assert torch.equal(transform.mean, restored.mean)

@@ -1,0 +1,173 @@
+"""The gate: every form of an exported policy must agree with the policy that was trained."""
+
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+
+from physai.artifact import stranger
+from physai.artifact.module import VIEWS, DeployablePolicy
+from physai.artifact.states import States
+from physai.deploy.metadata import INPUTS, OUTPUT
+from physai.deploy.policy import load_module
+from physai.envs.make import TransformedRobotEnv
+from physai.errors import UserError
+from physai.training.evaluation import Evaluation, evaluate
+from physai.transforms import Observation, ObservationNormalization
+
+BATCH_TOLERANCE = 1e-5  # rad/s; a row of a batch is rounded otherwise than the same row alone
+ONNX_TOLERANCE = 1e-5  # rad/s
+SUCCESS_TOLERANCE = 0.01
+
+Function = Callable[[Tensor, Tensor, Tensor], Tensor]
+
+
+class GateError(UserError):
+    """The exported policy is not the trained one: which stage, which input, how much."""
+
+
+def compare(stage: str, what: str, found: Tensor, expected: Tensor, states: States, tolerance: float = 0.0) -> float:
+    """Return the largest difference of two [S, m] tensors.
+
+    Args:
+        stage: Name of the stage, for the error.
+        what: What is compared, for the error.
+        found: What the exported policy gives.
+        expected: What it should give.
+        states: The inputs, S of them.
+        tolerance: Largest difference allowed; 0 demands equality of all bits, but for the sign of a zero.
+
+    Raises:
+        GateError: If they differ by more, or are not numbers.
+    """
+    if found.shape != expected.shape:
+        raise GateError(f"{stage}: {what} has the shape {list(found.shape)}, not {list(expected.shape)}")
+    difference = (found.double() - expected.double()).abs().nan_to_num(nan=torch.inf)
+    worst = float(difference.max())
+    if worst > tolerance:
+        row = int(difference.max(dim=1).values.argmax())
+        raise GateError(
+            f"{stage}: {what} differs by {worst:.3g} (allowed: {tolerance:g}) at {states.describe(row)}: "
+            f"{found[row].tolist()}, not {expected[row].tolist()}"
+        )
+    return worst
+
+
+def each(function: Function, states: States) -> Tensor:
+    """Call a function on one state after the other, as a robot does; stack what it returns."""
+    return torch.cat([function(*states.row(index)) for index in range(len(states.goal))])
+
+
+@torch.no_grad()
+def check_against_env(
+    policy: DeployablePolicy,
+    actor: TensorDictModuleBase,
+    env: TransformedRobotEnv,
+    moments: TensorDictBase,
+    states: States,
+) -> float:
+    """The eager artifact against the policy in its environment.
+
+    First on moments of its work: views and command within rounding of what the env showed and the actor did there.
+    Then on all states, one by one, through the env's own transforms: equal to the last bit.
+
+    Returns:
+        Largest difference of a command on ``moments``, rad/s.
+
+    Raises:
+        GateError: If anything differs.
+    """
+    stage = "the artifact is not the policy in its environment"
+    met = States(*(moments.get(key) for key in INPUTS))
+    for key, view in zip(VIEWS, policy.views(*met), strict=True):
+        scale = moments.get(key).abs().max().clamp(min=1.0)
+        compare(stage, key, view / scale, moments.get(key) / scale, met, BATCH_TOLERANCE)
+    action = moments.get("action").clamp(-1.0, 1.0)
+    limit = torch.tensor(env.simulation.config.max_velocity)
+    worst = compare(stage, OUTPUT, policy(*met), action * limit, met, BATCH_TOLERANCE)
+
+    transforms = [t for t in env.transform if isinstance(t, Observation | ObservationNormalization)]
+    for index in range(len(states.goal)):
+        row = states.row(index)
+        seen = TensorDict(dict(zip(INPUTS, row, strict=True)), batch_size=[1])
+        for transform in transforms:
+            seen = transform._step(seen, seen)
+        for key, view in zip(VIEWS, policy.views(*row), strict=True):
+            compare(stage, key, view, seen.get(key), row)
+        compare(stage, OUTPUT, policy(*row), actor(seen).get("action") * limit, row)
+        distance = env.simulation.observation.distance(row.joint_position, row.goal)
+        compare(stage, "distance", policy.distance(row.joint_position, row.goal), distance, row)
+    return worst
+
+
+def run_stranger(content: bytes, states: States) -> Tensor:
+    """Commands [S, n] of a TorchScript file in a fresh process that cannot import physai, tensordict or torchrl.
+
+    Raises:
+        GateError: If the file does not run there.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        policy, inputs, outputs = (Path(folder) / name for name in ("policy.pt", "inputs.npz", "outputs.npy"))
+        policy.write_bytes(content)
+        position, velocity, goal = (value.numpy() for value in states)
+        np.savez(inputs, joint_position=position, joint_velocity=velocity, goal=goal)
+        command = [sys.executable, "-I", stranger.__file__, str(policy), str(inputs), str(outputs)]
+        process = subprocess.run(command, capture_output=True, text=True)
+        if process.returncode:
+            last = (process.stderr.strip().splitlines() or ["no reason given"])[-1]
+            raise GateError(f"a fresh process without physai cannot run the file: {last[:160]}")
+        return torch.from_numpy(np.load(outputs))
+
+
+def check_onnx(runtime: Function, expected: Tensor, states: States) -> float:
+    """Return the largest difference of the commands in ONNX Runtime, one by one and all at once, rad/s.
+
+    Raises:
+        GateError: If it is larger than ``ONNX_TOLERANCE``.
+    """
+    stage = "ONNX Runtime disagrees"
+    return max(
+        compare(f"{stage} ({how})", OUTPUT, found, expected, states, ONNX_TOLERANCE)
+        for how, found in (("one by one", each(runtime, states)), ("in a batch", runtime(*states)))
+    )
+
+
+def check_drive(
+    content: bytes, actor: TensorDictModuleBase, env: TransformedRobotEnv, episodes: int, seed: int
+) -> Evaluation:
+    """Let a TorchScript file drive the simulated robots, and return how well it did.
+
+    Raises:
+        GateError: If its success rate is not that of the actor on the same goals.
+    """
+    driven = evaluate(_Driver(content, env.simulation.config.max_velocity), env, episodes, seed)
+    judged = evaluate(actor, env, episodes, seed)
+    if abs(driven.success_rate - judged.success_rate) > SUCCESS_TOLERANCE:
+        raise GateError(
+            f"the artifact does not drive as the policy does: it reaches {driven.success_rate:.1%} of {episodes:,} "
+            f"goals, the policy {judged.success_rate:.1%}"
+        )
+    return driven
+
+
+class _Driver(TensorDictModuleBase):
+    """A policy file in the place of the actor: sees only what a robot senses."""
+
+    in_keys = INPUTS
+    out_keys = ("action",)
+
+    def __init__(self, content: bytes, max_velocity: float) -> None:
+        super().__init__()
+        self.module = load_module(content)
+        self.max_velocity = max_velocity
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        command = self.module(*(tensordict.get(key) for key in self.in_keys))
+        return tensordict.set("action", command / self.max_velocity)

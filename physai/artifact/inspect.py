@@ -1,0 +1,78 @@
+"""What a policy file says about itself, for people."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from physai.artifact import onnx
+from physai.deploy import Metadata, PolicyError, archive, read_metadata
+
+
+def show(path: Path) -> None:
+    """Print the metadata of a ``policy.pt`` or ``policy.onnx``; nothing in the file is run.
+
+    Raises:
+        PolicyError: If it is no policy file, or damaged.
+        UserError: If an ONNX file cannot be read.
+    """
+    if path.suffix == ".onnx":
+        text = onnx.read_metadata(archive.read(path))
+        if text is None:
+            raise PolicyError(f"{path}: an ONNX file, but no physai policy")
+        metadata = Metadata.parse(text)
+    else:
+        metadata = read_metadata(path)
+    console = Console()
+    console.print(_summary(path, metadata))
+    console.print(_joints(metadata))
+    console.print("Config:", json.dumps(metadata.raw.get("config", {}), indent=2), highlight=False, markup=False)
+
+
+def _summary(path: Path, metadata: Metadata) -> Table:
+    raw = metadata.raw
+    low, high = raw["evaluation"]["success_ci"]
+    evaluation = raw["evaluation"]
+    inner, outer = metadata.goal_radius
+    rows = {
+        "robot": f"{metadata.robot}, end effector {raw['robot']['end_effector']}",
+        "URDF SHA-256": raw["robot"]["urdf_sha256"],
+        "inputs": _shapes(raw["inputs"], raw["units"]),
+        "output": _shapes(raw["outputs"], raw["units"]),
+        "control rate": f"{metadata.control_rate:g} Hz",
+        "goals": f"in frame '{metadata.goal_frame}', {inner:g} to {outer:g} m from its origin, within "
+        f"{metadata.goal_tolerance:g} m",
+        "evaluation": f"{evaluation['success_rate']:.1%} success (95 % interval {low:.1%} to {high:.1%}) on "
+        f"{evaluation['episodes']:,} goals, randomization {evaluation['randomization']}",
+        "checkpoint": f"{raw['checkpoint']['which']}, {raw['checkpoint']['frames']:,} frames",
+        "golden pairs": str(len(metadata.golden["goal"])),
+        "versions": ", ".join(f"{name} {version}" for name, version in raw["versions"].items()),
+        "git commit": str(raw["git_commit"]),
+        "created": raw["created"],
+        "code and weights": f"SHA-256 {metadata.content_sha256}",
+    }
+    table = Table(title=str(path), show_header=False, title_justify="left")
+    for row in rows.items():
+        table.add_row(*row)
+    return table
+
+
+def _joints(metadata: Metadata) -> Table:
+    table = Table(title="Joints, in the policy's order", title_justify="left")
+    for column in ("joint", "position, rad", "velocity, rad/s", "effort, N m", "command, rad/s"):
+        table.add_column(column, justify="left" if column == "joint" else "right")
+    columns: tuple[Any, ...] = (
+        metadata.position_limit,
+        metadata.velocity_limit,
+        metadata.effort_limit,
+        metadata.command_limit,
+    )
+    for name, (lower, upper), velocity, effort, command in zip(metadata.joints, *columns, strict=True):
+        table.add_row(name, f"{lower:g} to {upper:g}", f"{velocity:g}", f"{effort:g}", f"±{command:g}")
+    return table
+
+
+def _shapes(shapes: dict[str, list[Any]], units: dict[str, str]) -> str:
+    return ", ".join(f"{key} [{', '.join(map(str, shape))}] {units[key]}" for key, shape in shapes.items())

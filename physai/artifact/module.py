@@ -1,0 +1,113 @@
+"""Everything between a robot's sensors and its velocity command as one scriptable TensorDictModule."""
+
+import copy
+import io
+import warnings
+
+import torch
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor, nn
+
+from physai.deploy.archive import METADATA
+from physai.deploy.metadata import INPUTS, OUTPUT
+from physai.envs.make import TransformedRobotEnv
+from physai.errors import UserError
+
+VIEWS = ("observation", "normalized_observation", "features")  # what a policy can see on a robot
+
+
+class DeployablePolicy(TensorDictModuleBase):
+    """Kinematics, observation, frozen normalization, network, squashing and scaling.
+
+    It shares no memory with what it was made from, and needs no gradients.
+
+    Args:
+        observation: The task's observation module.
+        normalizer: Normalizes an observation.
+        network: Maps what it sees, side by side, to actions in [-1, 1].
+        in_keys: What the network sees, of ``VIEWS``, in order.
+        command_limit: What an action of 1 means, rad/s, [n].
+
+    Raises:
+        UserError: If the policy sees what no robot can tell it.
+    """
+
+    __jit_unused_properties__ = ("in_keys", "out_keys", "out_keys_source")  # of the base class; they do not script
+
+    def __init__(
+        self,
+        observation: nn.Module,
+        normalizer: nn.Module,
+        network: nn.Module,
+        in_keys: list[str],
+        command_limit: Tensor,
+    ) -> None:
+        super().__init__()
+        for key in in_keys:
+            if key not in VIEWS:
+                raise UserError(
+                    f"policy.actor.in_keys: a policy that sees '{key}' cannot be exported, for no robot can tell it; "
+                    f"it can see {', '.join(VIEWS)}"
+                )
+        self.in_keys = list(INPUTS)
+        self.out_keys = [OUTPUT]
+        self.observation = copy.deepcopy(observation)
+        self.normalizer = copy.deepcopy(normalizer)
+        self.network = copy.deepcopy(network)
+        self.seen = [VIEWS.index(key) for key in in_keys]
+        self.command_limit: Tensor
+        self.register_buffer("command_limit", command_limit.clone())
+        self.requires_grad_(False)
+        self.eval()
+
+    def forward(self, joint_position: Tensor, joint_velocity: Tensor, goal: Tensor) -> Tensor:
+        """Map positions [N, n] rad, velocities [N, n] rad/s and goals [N, 2] m to velocity commands [N, n], rad/s."""
+        views = self.views(joint_position, joint_velocity, goal)
+        return self.network(torch.cat([views[i] for i in self.seen], dim=1)) * self.command_limit
+
+    def views(self, joint_position: Tensor, joint_velocity: Tensor, goal: Tensor) -> list[Tensor]:
+        """What the policy can see, in the order of ``VIEWS``."""
+        observation, features = self.observation(joint_position, joint_velocity, goal)
+        return [observation, self.normalizer(observation), features]
+
+    @torch.jit.export
+    def distance(self, joint_position: Tensor, goal: Tensor) -> Tensor:
+        """Distance of the end effector to the goal, m: [N, n] rad and [N, 2] m to [N, 1]."""
+        distance: Tensor = self.observation.distance(joint_position, goal)  # type: ignore[operator]
+        return distance
+
+
+def make_deployable(actor: TensorDictModuleBase, env: TransformedRobotEnv) -> DeployablePolicy:
+    """Put a trained actor and the env that it was trained in together.
+
+    Raises:
+        UserError: If the policy sees what no robot can tell it.
+    """
+    joints = len(env.simulation.spec.joints)
+    limit = torch.full((joints,), env.simulation.config.max_velocity)
+    normalizer = env.normalization.normalizer
+    return DeployablePolicy(env.simulation.observation, normalizer, actor.deterministic(), actor.in_keys, limit)
+
+
+def script(policy: DeployablePolicy) -> torch.jit.ScriptModule:
+    """Compile to TorchScript.
+
+    Raises:
+        UserError: If a part of the policy is no TorchScript; it says what.
+    """
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", DeprecationWarning)
+            return torch.jit.script(policy)
+    except (RuntimeError, TypeError, AttributeError, OSError) as error:
+        reason = " ".join(str(error).split())[:160]
+        raise UserError(f"the policy cannot be exported: a part of it is no TorchScript ({reason})") from None
+
+
+def save(scripted: torch.jit.ScriptModule, metadata: str | None = None) -> bytes:
+    """The content of a policy file; metadata does not change how its code and weights are written."""
+    target = io.BytesIO()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)
+        torch.jit.save(scripted, target, _extra_files=None if metadata is None else {METADATA: metadata})
+    return target.getvalue()

@@ -1,0 +1,104 @@
+"""The policy as ONNX, for runtimes that are not PyTorch."""
+
+import contextlib
+import importlib.util
+import io
+import logging
+import warnings
+from collections.abc import Iterator
+
+import torch
+from torch import Tensor
+
+from physai.artifact.states import States
+from physai.deploy.archive import METADATA
+from physai.deploy.metadata import INPUTS, OUTPUT
+from physai.errors import UserError
+
+PACKAGES = ("onnx", "onnxscript", "onnxruntime")
+
+
+def missing() -> list[str]:
+    """Packages of the ``onnx`` extra that are not installed."""
+    return [name for name in PACKAGES if importlib.util.find_spec(name) is None]
+
+
+def convert(policy: torch.nn.Module, states: States) -> bytes:
+    """Convert a policy, for any number of rows.
+
+    Args:
+        policy: The module.
+        states: Examples of its inputs, at least two.
+
+    Raises:
+        UserError: If a part of it has no ONNX; it says which.
+    """
+    rows = torch.export.Dim("N")
+    with _quiet():
+        try:
+            program = torch.onnx.export(
+                policy,
+                tuple(value[:2].clone() for value in states),
+                dynamo=True,
+                dynamic_shapes=({0: rows},) * len(INPUTS),
+                input_names=list(INPUTS),
+                output_names=[OUTPUT],
+                verbose=False,
+            )
+        except Exception as error:  # its own hierarchy is private
+            reason = " ".join(str(error).split())[:160]
+            raise UserError(f"the policy cannot be exported to ONNX ({reason})") from None
+        assert program is not None
+        return program.model_proto.SerializeToString()
+
+
+def describe(content: bytes, metadata: str) -> bytes:
+    """Add metadata to an ONNX file."""
+    import onnx
+
+    model = onnx.load_from_string(content)
+    onnx.helper.set_model_props(model, {METADATA: metadata})
+    return model.SerializeToString()
+
+
+def read_metadata(content: bytes) -> str | None:
+    """The metadata of an ONNX file, if it has any.
+
+    Raises:
+        UserError: If it is no ONNX file.
+    """
+    import onnx
+
+    try:
+        model = onnx.load_from_string(content)
+    except Exception as error:  # protobuf's errors differ between its implementations
+        raise UserError(f"not an ONNX file ({' '.join(str(error).split())[:80]})") from None
+    return {entry.key: entry.value for entry in model.metadata_props}.get(METADATA)
+
+
+class Runtime:
+    """The file in ONNX Runtime."""
+
+    def __init__(self, content: bytes) -> None:
+        import onnxruntime
+
+        self._session = onnxruntime.InferenceSession(content, providers=["CPUExecutionProvider"])
+
+    def __call__(self, joint_position: Tensor, joint_velocity: Tensor, goal: Tensor) -> Tensor:
+        """As the policy."""
+        inputs = zip(INPUTS, (joint_position, joint_velocity, goal), strict=True)
+        (output,) = self._session.run([OUTPUT], {key: value.numpy() for key, value in inputs})
+        return torch.from_numpy(output)
+
+
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """The exporter tells its life on standard output, in logs and in warnings."""
+    before = logging.root.manager.disable
+    logging.disable(logging.WARNING)
+    try:
+        with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        logging.disable(before)

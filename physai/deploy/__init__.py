@@ -1,0 +1,25 @@
+"""What a robot computer needs: a policy file, checked and loaded, and a controller that drives with it safely.
+
+Importing it takes torch and numpy, and nothing else.
+"""
+
+from physai.deploy.controller import Command, Controller, State
+from physai.deploy.goals import Goal
+from physai.deploy.joints import JointState
+from physai.deploy.metadata import Metadata, PolicyError
+from physai.deploy.parameters import ControllerConfig
+from physai.deploy.policy import Policy, load_policy, read_metadata
+
+__all__ = [
+    "Command",
+    "Controller",
+    "ControllerConfig",
+    "Goal",
+    "JointState",
+    "Metadata",
+    "Policy",
+    "PolicyError",
+    "State",
+    "load_policy",
+    "read_metadata",
+]

@@ -1,0 +1,56 @@
+"""Goals from outside: which are taken, and which are not."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from physai.deploy.metadata import Metadata
+
+
+@dataclass(frozen=True)
+class Goal:
+    """Where the end effector shall go.
+
+    Attributes:
+        position: x and y in the frame, m.
+        frame: Name of the frame.
+    """
+
+    position: Sequence[float]
+    frame: str
+
+
+class GoalRejected(Exception):  # noqa: N818
+    """A goal that cannot be taken: ``kind`` for counting, and a line for people."""
+
+    def __init__(self, kind: str, message: str) -> None:
+        super().__init__(message)
+        self.kind = kind
+
+
+def accept(goal: Goal, metadata: Metadata, project: bool) -> np.ndarray:
+    """Return the goal's position [2], m, moved onto the ring of reachable goals if that is allowed.
+
+    Raises:
+        GoalRejected: If it is not two finite numbers in the right frame, or out of reach.
+    """
+    try:
+        position = np.array(goal.position, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError):
+        raise GoalRejected("malformed", "goal rejected: it is not two numbers") from None
+    if position.shape != (2,):
+        raise GoalRejected("malformed", f"goal rejected: it has the shape {list(position.shape)}, not [2]")
+    if not np.isfinite(position).all():
+        raise GoalRejected("not finite", "goal rejected: it is not finite")
+    if goal.frame != metadata.goal_frame:
+        raise GoalRejected("wrong frame", f"goal rejected: frame '{goal.frame}' is not '{metadata.goal_frame}'")
+    inner, outer = metadata.goal_radius
+    radius = math.hypot(*position)
+    # A goal on the very edge, written with fewer digits, is meant to be in.
+    if inner - 1e-6 <= radius <= outer + 1e-6:
+        return position
+    if project and radius > 1e-6:
+        return position * (min(max(radius, inner), outer) / radius)
+    raise GoalRejected("unreachable", f"goal rejected: {radius:.3f} m from the base, not {inner:g} to {outer:g} m")

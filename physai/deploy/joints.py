@@ -1,0 +1,129 @@
+"""Joint states from outside: mapped by name, checked, and refused where they cannot be true."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from physai.deploy.metadata import Metadata
+from physai.deploy.parameters import ControllerConfig
+
+_ENCODER_NOISE = 0.01  # rad; what two readings of a still joint may differ by, however close in time
+
+
+@dataclass(frozen=True)
+class JointState:
+    """What sensor_msgs/JointState carries.
+
+    Attributes:
+        names: Joint names, in any order; more than the policy's are welcome.
+        position: rad, one a name.
+        velocity: rad/s, one a name, or empty.
+        stamp: When it was measured, s, by the clock of its source; orders states and gives the time between them.
+        received: When it came in, s, by the clock of ``Controller.update``; None means now. A state that is known to
+            have travelled for long is given the time at which it set out.
+    """
+
+    names: Sequence[str]
+    position: Sequence[float]
+    velocity: Sequence[float]
+    stamp: float
+    received: float | None = None
+
+
+class StateRejected(Exception):  # noqa: N818
+    """A joint state that cannot be used: ``kind`` for counting, a line for people.
+
+    Attributes:
+        implausible: Whether it is well formed but cannot be true, so that the arm must stop at once.
+    """
+
+    def __init__(self, kind: str, message: str, implausible: bool = False) -> None:
+        super().__init__(f"joint state rejected: {message}")
+        self.kind = kind
+        self.implausible = implausible
+
+
+class JointReader:
+    """Turns joint states into positions and velocities in the policy's order, and remembers the last well-formed one.
+
+    Args:
+        metadata: Names and velocity limits of the joints.
+        config: ``jump_factor``, ``allow_velocity_estimate`` and ``state_timeout`` are used.
+    """
+
+    def __init__(self, metadata: Metadata, config: ControllerConfig) -> None:
+        self._joints = metadata.joints
+        self._speed = metadata.velocity_limit * config.jump_factor
+        self._estimate = config.allow_velocity_estimate
+        self._timeout = config.state_timeout
+        self._names: tuple[str, ...] = ()
+        self._index: list[int] = []
+        self._before: tuple[np.ndarray, float] | None = None
+
+    def read(self, state: JointState) -> tuple[np.ndarray, np.ndarray]:
+        """Return positions [n] rad and velocities [n] rad/s.
+
+        Raises:
+            StateRejected: If it cannot be used, and why.
+        """
+        names = tuple(state.names)
+        if names != self._names:
+            self._index, self._names = self._map(names), names
+        position = _numbers(state.position, len(names), "position")[self._index]
+        _finite(position, "position")
+        velocity = _numbers(state.velocity, len(names), "velocity") if len(state.velocity) else None
+        if not math.isfinite(state.stamp):
+            raise StateRejected("stamp not finite", "its stamp is not finite")
+        before, self._before = self._before, (position, state.stamp)
+        elapsed = 0.0
+        if before is not None:
+            elapsed = state.stamp - before[1]
+            self._check_motion(position - before[0], elapsed)
+        velocity = np.full(len(position), np.nan) if velocity is None else velocity[self._index]
+        unknown = ~np.isfinite(velocity)
+        if unknown.any():
+            if not self._estimate:
+                raise StateRejected("velocity missing", "a velocity is missing or not finite")
+            if before is None or elapsed > self._timeout:
+                raise StateRejected("velocity missing", "a velocity is missing, with no recent position to estimate it")
+            velocity = np.where(unknown, (position - before[0]) / elapsed, velocity)
+        if (np.abs(velocity) > self._speed).any():
+            raise StateRejected("velocity implausible", f"velocities {velocity.tolist()} rad/s cannot be true", True)
+        return position, velocity
+
+    def _map(self, names: tuple[str, ...]) -> list[int]:
+        if len(set(names)) != len(names):
+            raise StateRejected("duplicate name", "a joint is named twice")
+        for joint in self._joints:
+            if joint not in names:
+                raise StateRejected("joint missing", f"joint '{joint}' is missing")
+        return [names.index(joint) for joint in self._joints]
+
+    def _check_motion(self, moved: np.ndarray, elapsed: float) -> None:
+        if elapsed == 0:
+            raise StateRejected("stamp repeated", "its stamp is that of the state before", True)
+        if elapsed < 0:
+            raise StateRejected("stamp backwards", f"its stamp runs {-elapsed:.3f} s backwards", True)
+        far = np.abs(moved) > self._speed * elapsed + _ENCODER_NOISE
+        if far.any():
+            joint = int(far.argmax())
+            text = f"'{self._joints[joint]}' jumped by {moved[joint]:.3f} rad in {elapsed:.3f} s"
+            raise StateRejected("position jump", text, True)
+
+
+def _numbers(values: Sequence[float], count: int, what: str) -> np.ndarray:
+    try:
+        array: np.ndarray[Any, Any] = np.array(values, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError):
+        raise StateRejected("malformed", f"its {what} is not a list of numbers") from None
+    if array.shape != (count,):
+        raise StateRejected("lengths disagree", f"{count} names, but {what} has the shape {list(array.shape)}")
+    return array
+
+
+def _finite(array: np.ndarray, what: str) -> None:
+    if not np.isfinite(array).all():
+        raise StateRejected(f"{what} not finite", f"a {what} is not finite")

@@ -1,0 +1,139 @@
+"""What a policy file says about itself: which robot, in which order and units, within which limits."""
+
+import json
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from physai.errors import UserError
+
+FORMAT = "physai.policy"
+FORMAT_VERSION = 1
+INPUTS = ("joint_position", "joint_velocity", "goal")
+OUTPUT = "joint_velocity_command"
+
+
+class PolicyError(UserError):
+    """A policy file that cannot be trusted or does not fit: one line that says why."""
+
+
+@dataclass(frozen=True, eq=False)
+class Metadata:
+    """The checked part of a policy's metadata; ``raw`` has all of it.
+
+    Attributes:
+        raw: The JSON object.
+        robot: Name of the robot.
+        joints: Names of the n joints, in the policy's order; the arrays below follow it.
+        position_limit: rad, [n, 2]; infinite for continuous joints.
+        velocity_limit: rad/s, [n].
+        effort_limit: N·m, [n].
+        command_limit: Largest velocity that the policy commands, rad/s, [n].
+        control_rate: Hz.
+        goal_frame: Link in whose frame goals are given.
+        goal_radius: Nearest and farthest goal from that frame's origin, m.
+        goal_tolerance: Distance that counts as reached, m.
+        golden: Inputs and the output that the policy gave for them when it was exported, one row each, float32.
+        content_sha256: Hash of the code and weights that this describes.
+    """
+
+    raw: dict[str, Any]
+    robot: str
+    joints: tuple[str, ...]
+    position_limit: np.ndarray
+    velocity_limit: np.ndarray
+    effort_limit: np.ndarray
+    command_limit: np.ndarray
+    control_rate: float
+    goal_frame: str
+    goal_radius: tuple[float, float]
+    goal_tolerance: float
+    golden: dict[str, np.ndarray]
+    content_sha256: str
+
+    @classmethod
+    def parse(cls, text: str) -> "Metadata":
+        """Read and check the JSON.
+
+        Raises:
+            PolicyError: If a part is missing, of the wrong shape, or impossible; it says which.
+        """
+        try:
+            raw = json.loads(text)
+        except (ValueError, RecursionError) as error:
+            raise PolicyError(f"the metadata is damaged ({str(error)[:80]})") from None
+        if not isinstance(raw, dict) or raw.get("format") != FORMAT:
+            raise PolicyError("the metadata is not that of a physai policy")
+        if raw.get("format_version") != FORMAT_VERSION:
+            raise PolicyError(
+                f"format version {raw.get('format_version')!r}; this physai reads {FORMAT_VERSION}: "
+                "export the policy again with it"
+            )
+        joints = _get(raw, "robot.joints", list)
+        if not joints or not all(isinstance(name, str) for name in joints) or len(set(joints)) != len(joints):
+            raise PolicyError("metadata: robot.joints must be distinct names")
+        n = len(joints)
+        position = _array(raw, "limits.position", (n, 2), infinite=True)
+        if not (position[:, 0] < position[:, 1]).all():
+            raise PolicyError("metadata: limits.position must be pairs of lower and upper limit")
+        inner, outer = _array(raw, "goal.radius", (2,))
+        if not 0 <= inner <= outer:
+            raise PolicyError("metadata: goal.radius must be an inner and an outer radius")
+        sizes = {"joint_position": n, "joint_velocity": n, "goal": 2, OUTPUT: n}
+        for key, size in sizes.items():
+            side = "outputs" if key == OUTPUT else "inputs"
+            if _get(raw, side, dict).get(key) != ["N", size] or len(raw[side]) != (1 if key == OUTPUT else 3):
+                raise PolicyError(f"metadata: {side} must be {[k for k in sizes if (k == OUTPUT) == (key == OUTPUT)]}")
+        pairs = len(_get(raw, f"golden.{OUTPUT}", list))
+        if not pairs:
+            raise PolicyError("metadata: there are no golden pairs")
+        return cls(
+            raw=raw,
+            robot=_get(raw, "robot.name", str),
+            joints=tuple(joints),
+            position_limit=position,
+            velocity_limit=_positive(raw, "limits.velocity", (n,)),
+            effort_limit=_positive(raw, "limits.effort", (n,)),
+            command_limit=_positive(raw, "limits.command", (n,)),
+            control_rate=float(_positive(raw, "control_rate", ())),
+            goal_frame=_get(raw, "goal.frame", str),
+            goal_radius=(float(inner), float(outer)),
+            goal_tolerance=float(_positive(raw, "goal.tolerance", ())),
+            golden={key: _array(raw, f"golden.{key}", (pairs, size)).astype(np.float32) for key, size in sizes.items()},
+            content_sha256=_get(raw, "content_sha256", str),
+        )
+
+
+def _get(raw: dict[str, Any], key: str, kind: type) -> Any:
+    value: Any = raw
+    for part in key.split("."):
+        if not isinstance(value, dict) or part not in value:
+            raise PolicyError(f"metadata: {key} is missing")
+        value = value[part]
+    if not isinstance(value, kind):
+        raise PolicyError(f"metadata: {key} must be a {kind.__name__}")
+    return value
+
+
+def _array(raw: dict[str, Any], key: str, shape: tuple[int, ...], infinite: bool = False) -> np.ndarray:
+    value = _get(raw, key, object)
+    try:
+        array = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError):
+        raise PolicyError(f"metadata: {key} must hold numbers") from None
+    if array.shape != shape:
+        raise PolicyError(f"metadata: {key} must have the shape {list(shape)}, not {list(array.shape)}")
+    if infinite:  # JSON has no infinity: null stands for a limit that does not exist
+        array = np.where(np.isnan(array), np.array([-math.inf, math.inf]), array)
+    elif not np.isfinite(array).all():
+        raise PolicyError(f"metadata: {key} must be finite")
+    return array
+
+
+def _positive(raw: dict[str, Any], key: str, shape: tuple[int, ...]) -> np.ndarray:
+    array = _array(raw, key, shape)
+    if not (array > 0).all():
+        raise PolicyError(f"metadata: {key} must be positive")
+    return array

@@ -1,0 +1,156 @@
+"""Loading a policy file with torch and numpy alone, and asking it for commands."""
+
+import hashlib
+import io
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike
+
+from physai.deploy import archive
+from physai.deploy.metadata import INPUTS, OUTPUT, Metadata, PolicyError
+
+if TYPE_CHECKING:
+    from tensordict.nn import TensorDictModule
+
+# Golden pairs are equal to the last bit where the processor is the one that recorded them; others round differently.
+GOLDEN_TOLERANCE = 1e-4  # rad/s
+
+
+class Policy:
+    """From what one robot senses to its joint velocities; of :func:`load_policy`. Not for several threads at once.
+
+    Attributes:
+        metadata: What the file says about itself.
+        sha256: Hash of the file.
+        golden_error: Largest difference to the recorded commands on this machine, rad/s; 0.0 if all bits agree.
+        module: The TorchScript module, for batches: float32 tensors [N, n], [N, n], [N, 2] to [N, n].
+    """
+
+    def __init__(self, module: torch.jit.ScriptModule, metadata: Metadata, sha256: str) -> None:
+        self.module = module
+        self.metadata = metadata
+        self.sha256 = sha256
+        self.golden_error = 0.0
+        n = len(metadata.joints)
+        # Each array shares its memory with the tensor beside it: filling it is cheaper than making tensors.
+        self._position, self._velocity, self._goal = (np.zeros((1, size), np.float32) for size in (n, n, 2))
+        self._tensors = [torch.from_numpy(array) for array in (self._position, self._velocity, self._goal)]
+
+    def __call__(self, joint_position: ArrayLike, joint_velocity: ArrayLike, goal: ArrayLike) -> np.ndarray:
+        """Map positions [n] rad, velocities [n] rad/s and a goal [2] m to velocity commands [n], rad/s, float32."""
+        self._position[0], self._velocity[0], self._goal[0] = joint_position, joint_velocity, goal
+        return self.module(*self._tensors)[0].numpy()
+
+    def distance(self, joint_position: ArrayLike, goal: ArrayLike) -> float:
+        """Distance of the end effector to a goal [2] m at joint positions [n] rad, in m."""
+        self._position[0], self._goal[0] = joint_position, goal
+        return float(self.module.distance(self._tensors[0], self._tensors[2]))
+
+    def as_tensordict_module(self) -> "TensorDictModule":
+        """Wrap the module for TorchRL code, with its keys; needs tensordict."""
+        from tensordict.nn import TensorDictModule
+
+        return TensorDictModule(self.module, in_keys=list(INPUTS), out_keys=[OUTPUT])
+
+
+def read_metadata(path: str | Path) -> Metadata:
+    """Read what a policy file says about itself; nothing in the file is unpickled or run.
+
+    Raises:
+        PolicyError: If it is not a policy file, or its code and weights are not those that it describes.
+    """
+    path = Path(path)
+    return _described(path, archive.check(path, archive.read(path)))
+
+
+def load_policy(path: str | Path, sha256: str | None = None, expect_joints: Sequence[str] | None = None) -> Policy:
+    """Check a policy file, load it, and see that it still gives the commands that it gave when it was exported.
+
+    A policy file is a program: its checks find damage and mix-ups. Only a hash that came to you another way than the
+    file proves who made it.
+
+    Args:
+        path: ``policy.pt``.
+        sha256: Its expected hash, in hexadecimal. Without it, a ``policy.pt.sha256`` that lies beside is used.
+        expect_joints: The joints that the robot's side expects, in the policy's order.
+
+    Raises:
+        PolicyError: If the file is missing, damaged, altered, of another format, or for other joints; it says which.
+    """
+    path = Path(path)
+    content = archive.read(path)
+    digest = hashlib.sha256(content).hexdigest()
+    expected, source = (sha256, "the expected one") if sha256 is not None else _beside(path)
+    if expected is not None and digest != expected.strip().lower():
+        raise PolicyError(f"{path}: its SHA-256 is {digest[:16]}..., not {source}, {expected.strip()[:16]}...")
+    checked = archive.check(path, content)
+    metadata = _described(path, checked)
+    if expect_joints is not None and tuple(expect_joints) != metadata.joints:
+        how = "in another order" if set(expect_joints) == set(metadata.joints) else "for other joints"
+        raise PolicyError(f"{path}: a policy {how}: {list(metadata.joints)}, not {list(expect_joints)}")
+    try:
+        policy = Policy(load_module(checked.content), metadata, digest)
+        policy.golden_error = _golden_error(policy)
+    except PolicyError as error:
+        raise PolicyError(f"{path}: {error}") from None
+    except Exception as error:  # whatever torch makes of a program that is not ours
+        raise PolicyError(f"{path}: cannot be run ({' '.join(str(error).split())[:120]})") from None
+    return policy
+
+
+def _beside(path: Path) -> tuple[str | None, str]:
+    beside = path.with_name(f"{path.name}.sha256")
+    if not beside.exists():
+        return None, ""
+    words = archive.read(beside).decode(errors="replace").split()
+    return (words[0] if words else ""), f"that of {beside.name}"
+
+
+def _described(path: Path, checked: archive.Archive) -> Metadata:
+    try:
+        metadata = Metadata.parse(checked.metadata)
+    except PolicyError as error:
+        raise PolicyError(f"{path}: {error}") from None
+    if metadata.content_sha256 != checked.content_sha256:
+        raise PolicyError(f"{path}: its code or weights are not those that were exported (content_sha256 differs)")
+    return metadata
+
+
+def load_module(content: bytes) -> torch.jit.ScriptModule:
+    """Load the TorchScript of a policy file that has been checked, or that is not written yet.
+
+    Raises:
+        PolicyError: If its methods are not those of a policy.
+        RuntimeError: If torch cannot read it.
+    """
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)  # of TorchScript, which this file is alone to use
+        module = torch.jit.load(io.BytesIO(content), map_location="cpu").eval()
+        for method, arguments in (("forward", INPUTS), ("distance", ("joint_position", "goal"))):
+            found = [a.name for a in getattr(module, method).schema.arguments[1:]] if hasattr(module, method) else None
+            if found != list(arguments):
+                raise PolicyError(f"its {method} takes {found}, not {list(arguments)}")
+        return torch.jit.freeze(module, preserved_attrs=["distance"])
+
+
+def _golden_error(policy: Policy) -> float:
+    """Run all pairs, thrice: the first calls also let TorchScript's profiling executor settle."""
+    golden, worst = policy.metadata.golden, 0.0
+    for _ in range(3):
+        for *inputs, expected in zip(*(golden[key] for key in (*INPUTS, OUTPUT)), strict=True):
+            command = policy(*inputs)
+            if command.shape != expected.shape or command.dtype != np.float32:
+                raise PolicyError(f"it gives {command.dtype} {list(command.shape)}, not float32 {list(expected.shape)}")
+            policy.distance(inputs[0], inputs[2])
+            worst = max(worst, float(np.abs(command - expected).max()))
+            if not worst <= GOLDEN_TOLERANCE:  # also where it is NaN
+                raise PolicyError(
+                    f"a golden pair differs by {worst:.3g} rad/s: at {[x.tolist() for x in inputs]} it gives "
+                    f"{command.tolist()}, and gave {expected.tolist()} when it was exported"
+                )
+    return worst

@@ -1,0 +1,65 @@
+"""``python -m physai.export``: turn the policy of a run into files for robots (see ``--help``)."""
+
+from pathlib import Path
+from typing import Literal
+
+from omegaconf import DictConfig
+
+from physai import cli
+from physai.config import Config, validate
+from physai.errors import UserError
+
+
+class ExportConfig(Config):
+    """``conf/export.yaml``."""
+
+    run: str | None
+    checkpoint: str | int
+    format: Literal["torchscript", "onnx", "all"]
+    inspect: str | None
+
+    @property
+    def formats(self) -> list[str]:
+        """Which files to write."""
+        return ["torchscript", "onnx"] if self.format == "all" else [self.format]
+
+
+def _check(node: DictConfig) -> None:
+    from physai.artifact import onnx
+    from physai.training.run import TrainedPolicy
+
+    config = validate(ExportConfig, node)
+    if (config.run is None) == (config.inspect is None):
+        raise UserError("run=<run folder> is needed to export, or inspect=<policy.pt> to look at a policy")
+    if config.run is None:
+        return
+    if "onnx" in config.formats and onnx.missing():
+        raise UserError(
+            f"ONNX needs {', '.join(onnx.missing())}: pip install 'physai[onnx]', or choose format=torchscript"
+        )
+    TrainedPolicy(Path(config.run), str(config.checkpoint))
+
+
+def _export(node: DictConfig, _: Path) -> None:
+    config = validate(ExportConfig, node)
+    if config.inspect is not None:
+        from physai.artifact.inspect import show
+
+        show(Path(config.inspect))
+    else:
+        assert config.run is not None
+        export(Path(config.run), str(config.checkpoint), config.formats)
+
+
+def export(run_dir: Path, which: str, formats: list[str]) -> None:
+    """Export a policy through the gate, and say what was checked and written."""
+    from physai.artifact import FILES, export_policy
+
+    print(f"Exporting the {which} policy of {run_dir}:", flush=True)
+    export_policy(run_dir, which, formats, lambda stage, result: print(f"  {stage:<38} {result}", flush=True))
+    for name in formats:
+        print(f"Policy: {run_dir / FILES[name]}")
+
+
+if __name__ == "__main__":
+    cli.main("export", _export, _check)
