@@ -34,10 +34,13 @@ def _config(node: DictConfig) -> "TrainConfig":
 
 def _check(node: DictConfig) -> None:
     """Build every part of a run in small, so that whatever is wrong shows before a run folder exists."""
+    from physai.artifact.module import make_deployable, script
     from physai.training.agent import Agent
 
     config = _config(node)
-    Agent.build(config).close()
+    agent = Agent.build(config)
+    script(make_deployable(agent.actor, agent.env))  # what cannot be exported is not worth training
+    agent.close()
 
 
 def _train(node: DictConfig, run_dir: Path) -> None:

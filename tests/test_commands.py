@@ -67,6 +67,10 @@ BAD_TRAINING = {
         ["policy.actor.hidden_sizes=[-3]"],
         "policy.actor.hidden_sizes: input should be greater than 0",
     ),
+    "a policy that no robot could run": (
+        ["policy.actor.in_keys=[features,physics_parameters]"],
+        "policy.actor.in_keys: a policy that sees 'physics_parameters' cannot be exported",
+    ),
     "zero robots": (["collector.num_envs=0"], "collector.num_envs: input should be greater than 0, got 0"),
     "negative seed": (["seed=-1"], "seed: input should be greater than or equal to 0, got -1"),
     "zero batch": (
@@ -224,6 +228,14 @@ def test_evaluate_says_how_sure_it_is_and_which_randomization_it_used(run, copie
         ("play", ["run=run", "output=arm.avi"], "must end in .mp4 or .gif"),
         ("play", ["run=run", "render=windw"], "render: input should be 'video' or 'human'"),
         ("plot", ["runs=[nowhere]"], "nowhere: no run there"),
+        ("export", [], "run=<run folder> is needed to export, or inspect=<policy.pt> to look at a policy"),
+        ("export", ["run=run", "inspect=run/policy.pt"], "run=<run folder> is needed"),
+        ("export", ["run=nowhere"], "nowhere: no run there"),
+        ("export", ["run=run", "checkpoint=7"], "no checkpoint '7'; there are: best"),
+        ("export", ["run=run", "format=tflite"], "format: input should be 'torchscript', 'onnx' or 'all'"),
+        ("export", ["inspect=nowhere.pt"], "nowhere.pt: no such file"),
+        ("export", ["inspect=run"], "run: not a file"),
+        ("export", ["inspect=run/checkpoints/best.pt"], "best.pt: "),
         ("plot", ["runs=[]"], "runs: list should have at least 1 item"),
     ],
 )
@@ -256,7 +268,7 @@ def test_plot_overlays_runs(run, copied, tmp_path):
     assert (tmp_path / "both.png").read_bytes().startswith(b"\x89PNG")
 
 
-@pytest.mark.parametrize("module", ["train", "evaluate", "play", "plot"])
+@pytest.mark.parametrize("module", ["train", "evaluate", "export", "play", "plot"])
 def test_help_shows_examples_and_every_value(run, module):
     code, output, _ = run(module, "--help")
     assert code == 0

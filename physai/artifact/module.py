@@ -99,7 +99,7 @@ def script(policy: DeployablePolicy) -> torch.jit.ScriptModule:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", DeprecationWarning)
             return torch.jit.script(policy)
-    except (RuntimeError, TypeError, AttributeError, OSError) as error:
+    except Exception as error:  # the compiler's errors have no base class of their own
         reason = " ".join(str(error).split())[:160]
         raise UserError(f"the policy cannot be exported: a part of it is no TorchScript ({reason})") from None
 

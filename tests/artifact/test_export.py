@@ -1,0 +1,166 @@
+"""Exporting a run: what lies in its folder afterwards, and what does not when something disagrees."""
+
+import hashlib
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import onnx
+import onnxruntime
+import pytest
+import torch
+
+import physai
+from physai.artifact import export as module
+from physai.artifact import export_policy, gate
+from physai.artifact.inspect import show
+from physai.deploy import load_policy, read_metadata
+from physai.errors import UserError
+from tests.training.small import SMALL, command
+
+
+@pytest.fixture
+def copied(exported_run, tmp_path):
+    shutil.copytree(exported_run, tmp_path / "run")
+    return tmp_path / "run"
+
+
+def metadata_of(run):
+    files = {"metadata.json": ""}
+    torch.jit.load(run / "policy.pt", _extra_files=files)
+    return json.loads(files["metadata.json"])
+
+
+def test_the_hash_beside_the_policy_is_its_own(exported_run):
+    digest, name = (exported_run / "policy.pt.sha256").read_text().split()
+    assert name == "policy.pt"
+    assert digest == hashlib.sha256((exported_run / "policy.pt").read_bytes()).hexdigest()
+    assert load_policy(exported_run / "policy.pt", sha256=digest).sha256 == digest
+
+
+def test_the_metadata_says_everything_a_robot_must_know(exported_run):
+    raw = metadata_of(exported_run)
+    assert (raw["format"], raw["format_version"]) == ("physai.policy", 1)
+    assert raw["robot"]["name"] == "planar_arm"
+    assert raw["robot"]["joints"] == ["joint1", "joint2"]
+    assert raw["limits"] == {
+        "position": [[-6.2832, 6.2832], [-2.6, 2.6]],
+        "velocity": [2.5, 2.5],
+        "effort": [5.0, 3.0],
+        "command": [2.0, 2.0],
+    }
+    assert raw["units"]["joint_velocity_command"] == "rad/s"
+    assert raw["control_rate"] == 50.0
+    assert raw["inputs"] == {"joint_position": ["N", 2], "joint_velocity": ["N", 2], "goal": ["N", 2]}
+    assert raw["outputs"] == {"joint_velocity_command": ["N", 2]}
+    assert raw["goal"] == {"frame": "base", "radius": [0.30, 0.53], "tolerance": 0.05}
+    urdf = Path(physai.__path__[0]) / "robots" / "assets" / "planar_arm.urdf"
+    assert raw["robot"]["urdf_sha256"] == hashlib.sha256(urdf.read_bytes()).hexdigest()
+    assert raw["config"]["total_frames"] == 120_000
+    low, high = raw["evaluation"]["success_ci"]
+    assert low <= raw["evaluation"]["success_rate"] <= high
+    assert raw["evaluation"]["episodes"] == 200
+    assert raw["versions"]["torch"] == torch.__version__
+    assert {"physai", "torchrl"} <= set(raw["versions"])
+    assert raw["created"].endswith("+00:00")
+    assert "git_commit" in raw
+
+
+def test_torchscript_and_onnx_carry_the_same_metadata(exported_run):
+    files = {"metadata.json": ""}
+    torch.jit.load(exported_run / "policy.pt", _extra_files=files)
+    properties = onnx.load(exported_run / "policy.onnx").metadata_props
+    assert {entry.key: entry.value for entry in properties}["metadata.json"].encode() == files["metadata.json"]
+
+
+def test_golden_pairs_are_full_precision_and_hold_in_both_forms(exported_run):
+    policy = load_policy(exported_run / "policy.pt")
+    golden = policy.metadata.golden
+    session = onnxruntime.InferenceSession(exported_run / "policy.onnx")
+    assert len(golden["goal"]) == 32
+    assert policy.golden_error == 0.0
+    for row in range(32):
+        inputs = {key: golden[key][row] for key in ("joint_position", "joint_velocity", "goal")}
+        assert np.array_equal(policy(*inputs.values()), golden["joint_velocity_command"][row])
+        (command,) = session.run(None, {key: value[None] for key, value in inputs.items()})
+        np.testing.assert_allclose(command[0], golden["joint_velocity_command"][row], rtol=0, atol=1e-5)
+
+
+def test_the_same_checkpoint_gives_the_same_program(exported_run, copied):
+    before = read_metadata(exported_run / "policy.pt").content_sha256
+    after = export_policy(copied, "best", ["torchscript"], episodes=8)
+    assert after.content_sha256 == before
+
+
+def plant(monkeypatch, defect):
+    def make(actor, env):
+        policy = make_deployable(actor, env)
+        defect(policy)
+        return policy
+
+    make_deployable = module.make_deployable
+    monkeypatch.setattr(module, "make_deployable", make)
+
+
+def test_what_does_not_pass_the_gate_leaves_the_old_files_as_they_were(copied, monkeypatch):
+    before = {path: path.read_bytes() for path in copied.glob("policy.*")}
+    assert len(before) == 3
+    plant(monkeypatch, lambda policy: policy.normalizer.loc.zero_())
+    with pytest.raises(gate.GateError, match="normalized_observation differs by"):
+        export_policy(copied, "best", ["torchscript", "onnx"])
+    assert {path: path.read_bytes() for path in copied.glob("policy.*")} == before
+
+
+def test_a_file_for_joints_in_another_order_is_refused_before_it_is_written(copied, monkeypatch):
+    for path in copied.glob("policy.*"):
+        path.unlink()
+    described = module.describe.describe_robot
+
+    def swapped(simulation):
+        content = described(simulation)
+        content["robot"]["joints"].reverse()
+        return content
+
+    monkeypatch.setattr(module.describe, "describe_robot", swapped)
+    with pytest.raises(UserError, match=r"a policy in another order: \['joint2', 'joint1'\]"):
+        export_policy(copied, "best", ["torchscript", "onnx"], episodes=8)
+    assert not list(copied.glob("policy.*"))
+
+
+def test_only_the_asked_form_is_written(copied):
+    for path in copied.glob("policy.*"):
+        path.unlink()
+    export_policy(copied, "last", ["torchscript"], episodes=8)
+    assert sorted(path.name for path in copied.glob("policy*")) == ["policy.pt", "policy.pt.sha256"]
+    assert metadata_of(copied)["checkpoint"]["which"] == "last"
+
+
+def test_each_stage_is_reported(copied):
+    stages = []
+    export_policy(copied, "best", ["onnx"], lambda stage, result: stages.append(f"{stage}: {result}"), episodes=8)
+    text = "\n".join(stages)
+    for part in ("1,024 states", "extremes", "to the last bit", "fresh process", "ONNX Runtime: within", "8 episodes"):
+        assert part in text
+
+
+@pytest.mark.parametrize("name", ["policy.pt", "policy.onnx"])
+def test_inspect_shows_it_to_people(exported_run, capsys, monkeypatch, name):
+    monkeypatch.setenv("COLUMNS", "200")
+    show(exported_run / name)
+    shown = capsys.readouterr().out
+    for part in ("planar_arm", "joint2", "-2.6 to 2.6", "50 Hz", "0.3 to 0.53 m", "success", "torchrl", '"clip": 10.0'):
+        assert part in shown
+
+
+@pytest.mark.slow
+def test_training_the_kuka_leaves_a_policy_and_its_hash(tmp_path):
+    process = command("train", *SMALL, "env=kuka_reacher", "hydra.run.dir=run", cwd=tmp_path)
+    output = process.communicate()[0]
+    assert process.returncode == 0, output
+    names = {"policy.pt", "policy.pt.sha256", "policy.onnx"}
+    assert names <= {path.name for path in (tmp_path / "run").iterdir()}
+    assert "Policy: run/policy.pt" in output
+    policy = load_policy(tmp_path / "run" / "policy.pt", expect_joints=["lbr_iiwa_joint_1", "lbr_iiwa_joint_2"])
+    assert policy.metadata.command_limit.tolist() == [0.5, 0.5]
+    assert policy.metadata.goal_frame == "lbr_iiwa_link_0"

@@ -1,0 +1,207 @@
+"""What is planted in an artifact, the gate finds: at which stage, at which input, how much."""
+
+import copy
+
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+from physai.artifact import gate, onnx
+from physai.artifact.module import make_deployable, save, script
+from physai.artifact.states import ON_POLICY, States, extremes, visit
+from physai.deploy.metadata import INPUTS
+from physai.training.run import TrainedPolicy
+
+
+@pytest.fixture(scope="module")
+def trained(exported_run):
+    actor, env = TrainedPolicy(exported_run, "best").deploy(64, seed=3)
+    moments = visit(actor, env)
+    yield actor, env, moments, States(*(moments.get(key)[::20] for key in INPUTS))
+    env.close()
+
+
+@pytest.fixture
+def check(trained):
+    """Run the first stage on an artifact that something is planted in."""
+    actor, env, moments, states = trained
+    policy = make_deployable(actor, env)
+
+    def check(plant=lambda policy: None):
+        plant(policy)
+        return gate.check_against_env(policy, actor, env, moments, states)
+
+    return check
+
+
+def test_the_states_are_those_of_the_policy_at_work(trained):
+    moments = trained[2]
+    assert len(moments) == ON_POLICY >= 1000
+    assert len(torch.unique(moments["goal"], dim=0)) > 64  # episodes end and others begin
+    assert moments["joint_velocity"].abs().max() > 0.5
+    assert (moments["episode_length"] > 0).any()
+    radius = moments["goal"].norm(dim=-1)
+    assert radius.min() >= 0.30 - 1e-6
+    assert radius.max() <= 0.53 + 1e-6
+
+
+def test_the_extremes_have_joint_limits_far_goals_and_huge_velocities(trained):
+    states = extremes(trained[1])
+    limits = torch.from_numpy(trained[1].simulation.spec.position_limit).float()
+    for joint in range(2):
+        for end in limits[joint]:
+            assert (states.joint_position[:, joint] == end).any()
+    assert states.goal.norm(dim=1).max() > 5.0
+    assert states.joint_velocity.abs().max() == 250.0
+    assert torch.isfinite(torch.cat(states, dim=1)).all()
+
+
+def test_an_artifact_is_equal_to_its_policy(check):
+    assert check() <= gate.BATCH_TOLERANCE
+
+
+def tamper_with_a_weight(policy):
+    with torch.no_grad():
+        policy.network[2].weight[5, 7] += 1e-3
+
+
+def forget_the_normalizer(policy):
+    policy.normalizer.loc.zero_()
+    policy.normalizer.scale.fill_(1.0)
+
+
+def forget_the_scale(policy):
+    policy.command_limit.fill_(1.0)
+
+
+def swap_the_joints(policy):
+    with torch.no_grad():
+        last = policy.network[-2]
+        last.weight.copy_(last.weight.flip(0))
+        last.bias.copy_(last.bias.flip(0))
+
+
+def swap_the_inputs(policy):
+    policy.seen = policy.seen[::-1]
+
+
+class OtherLayout(nn.Module):
+    """Velocities before positions."""
+
+    def __init__(self, inner):
+        super().__init__()
+        self.inner = inner
+
+    def forward(self, q, qd, goal):
+        observation, features = self.inner(q, qd, goal)
+        return torch.cat([observation[:, 2:4], observation[:, :2], observation[:, 4:]], dim=1), features
+
+    def distance(self, q, goal):
+        return self.inner.distance(q, goal)
+
+
+def change_the_layout(policy):
+    policy.observation = OtherLayout(policy.observation)
+
+
+def lengthen_a_link(policy):
+    policy.observation.kinematics.constant[1, 0, 3] += 0.001
+
+
+def break_the_distance(policy):
+    policy.observation.distance = lambda q, goal: torch.zeros(len(q), 1)
+
+
+@pytest.mark.parametrize(
+    ("plant", "what"),
+    [
+        (tamper_with_a_weight, "joint_velocity_command differs by"),
+        (forget_the_normalizer, "normalized_observation differs by"),
+        (forget_the_scale, "joint_velocity_command differs by"),
+        (swap_the_joints, "joint_velocity_command differs by"),
+        (swap_the_inputs, "joint_velocity_command differs by"),
+        (change_the_layout, ": observation differs by"),
+        (lengthen_a_link, ": observation differs by"),
+        (break_the_distance, "distance differs by"),
+    ],
+)
+def test_what_is_planted_is_found_and_named(check, plant, what):
+    with pytest.raises(gate.GateError) as refused:
+        check(plant)
+    message = str(refused.value)
+    assert message.startswith("the artifact is not the policy in its environment")
+    assert what in message
+    assert "joint_position=[" in message
+    assert "goal=[" in message
+    assert "\n" not in message
+
+
+def test_one_ulp_in_one_weight_is_found_at_batch_one(trained):
+    actor, env, moments, states = trained
+    policy = make_deployable(actor, env)
+    with torch.no_grad():
+        weight = policy.network[-2].weight
+        weight[0, 0] = torch.nextafter(weight[0, 0], torch.tensor(torch.inf))
+    with pytest.raises(gate.GateError, match="joint_velocity_command differs by"):
+        gate.check_against_env(policy, actor, env, moments, states)
+
+
+def test_a_number_that_is_not_finite_is_a_difference(trained):
+    states = trained[3]
+    expected = torch.zeros(len(states.goal), 2)
+    found = expected.clone()
+    found[4, 1] = torch.nan
+    with pytest.raises(gate.GateError, match="stage: command differs by inf") as refused:
+        gate.compare("stage", "command", found, expected, states, tolerance=1.0)
+    assert states.describe(4) in str(refused.value)
+    with pytest.raises(gate.GateError, match=r"shape \[3, 2\]"):
+        gate.compare("stage", "command", expected[:3], expected, states)
+
+
+def test_a_fresh_process_without_physai_gives_the_same_bits(trained):
+    actor, env, _, states = trained
+    policy = make_deployable(actor, env)
+    found = gate.run_stranger(save(script(policy)), states)
+    assert torch.equal(found, gate.each(policy, states))
+
+
+def test_a_file_that_a_stranger_cannot_run_is_refused(trained):
+    with pytest.raises(gate.GateError, match="a fresh process without physai cannot run the file"):
+        gate.run_stranger(b"not a file of torch", trained[3])
+
+
+def test_onnx_agrees_and_what_is_planted_in_it_is_found(trained):
+    actor, env, _, states = trained
+    policy = make_deployable(actor, env)
+    expected = gate.each(policy, states)
+    content = onnx.convert(policy, states)
+    assert gate.check_onnx(onnx.Runtime(content), expected, states) <= 1e-5
+    wrong = copy.deepcopy(policy)
+    tamper_with_a_weight(wrong)
+    with pytest.raises(gate.GateError, match=r"ONNX Runtime disagrees \(one by one\): joint_velocity_command differs"):
+        gate.check_onnx(onnx.Runtime(onnx.convert(wrong, states)), expected, states)
+
+
+def test_an_artifact_that_drives_worse_is_refused(trained):
+    actor, env, _, _ = trained
+    policy = make_deployable(actor, env)
+    driven = gate.check_drive(save(script(policy)), actor, env, 64, seed=5)
+    assert driven.success_rate > 0.9
+    policy.command_limit.mul_(-1)
+    with pytest.raises(gate.GateError, match="does not drive as the policy does: it reaches"):
+        gate.check_drive(save(script(policy)), actor, env, 64, seed=5)
+
+
+@pytest.mark.slow
+def test_in_closed_loop_the_artifact_succeeds_as_the_policy_does_on_a_thousand_goals(exported_run):
+    trained = TrainedPolicy(exported_run, "best")
+    actor, env = trained.deploy(1000, seed=11)
+    content = (exported_run / "policy.pt").read_bytes()
+    driven = gate.check_drive(content, actor, env, 1000, seed=11)
+    judged = trained.evaluate(1000, seed=11)
+    print(f"artifact {driven.success_rate:.1%}, policy {judged.success_rate:.1%}")
+    assert abs(driven.success_rate - judged.success_rate) <= 0.01
+    assert driven.success_rate > 0.9
+    np.testing.assert_allclose(driven.summary()["return"], judged.summary()["return"], rtol=0.01)
+    env.close()
