@@ -54,6 +54,8 @@ def _summary(path: Path, metadata: Metadata) -> Table:
         "code and weights": f"SHA-256 {metadata.content_sha256}",
     }
     table = Table(title=str(path), show_header=False, title_justify="left")
+    table.add_column()
+    table.add_column(overflow="fold")  # hashes are worth nothing when they are cut
     for row in rows.items():
         table.add_row(*row)
     return table

@@ -3,6 +3,7 @@
 import copy
 import io
 import warnings
+import zipfile
 
 import torch
 from tensordict.nn import TensorDictModuleBase
@@ -105,9 +106,16 @@ def script(policy: DeployablePolicy) -> torch.jit.ScriptModule:
 
 
 def save(scripted: torch.jit.ScriptModule, metadata: str | None = None) -> bytes:
-    """The content of a policy file; metadata does not change how its code and weights are written."""
-    target = io.BytesIO()
+    """The content of a policy file; metadata does not change how its code and weights are written.
+
+    TorchScript's debug records are left out: they hold paths of the machine that trained.
+    """
+    written, target = io.BytesIO(), io.BytesIO()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)
-        torch.jit.save(scripted, target, _extra_files=None if metadata is None else {METADATA: metadata})
+        torch.jit.save(scripted, written, _extra_files=None if metadata is None else {METADATA: metadata})
+    with zipfile.ZipFile(written) as complete, zipfile.ZipFile(target, "w") as lean:
+        for record in complete.infolist():
+            if not record.filename.endswith(".debug_pkl"):
+                lean.writestr(record, complete.read(record))
     return target.getvalue()

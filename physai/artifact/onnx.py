@@ -6,6 +6,7 @@ import io
 import logging
 import warnings
 from collections.abc import Iterator
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -49,7 +50,15 @@ def convert(policy: torch.nn.Module, states: States) -> bytes:
             reason = " ".join(str(error).split())[:160]
             raise UserError(f"the policy cannot be exported to ONNX ({reason})") from None
         assert program is not None
-        return program.model_proto.SerializeToString()
+        return _lean(program.model_proto).SerializeToString()
+
+
+def _lean(model: Any) -> Any:
+    """Leave out the exporter's notes: they hold stack traces and paths of the machine that trained."""
+    graph = model.graph
+    for part in (graph, *graph.node, *graph.input, *graph.output, *graph.value_info, *graph.initializer):
+        part.ClearField("metadata_props")
+    return model
 
 
 def describe(content: bytes, metadata: str) -> bytes:

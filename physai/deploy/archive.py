@@ -13,7 +13,7 @@ METADATA = "metadata.json"  # its name among TorchScript's extra files and among
 MAX_BYTES = 64 * 2**20
 _RECORD = re.compile(
     r"(data\.pkl|constants\.pkl|version|byteorder|\.data/serialization_id"
-    r"|(data|constants)/\d+|code/[\w/]+\.py(\.debug_pkl)?|extra/metadata\.json)"
+    r"|(data|constants)/\d+|code/[\w/]+\.py|extra/metadata\.json)"
 )
 
 
