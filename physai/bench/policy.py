@@ -1,0 +1,107 @@
+"""How long a policy takes for one command, in every form that it has."""
+
+import statistics
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from omegaconf import OmegaConf
+from rich.table import Table
+from tensordict import TensorDict
+from tensordict.nn import NormalParamExtractor, TensorDictModule
+from torch import nn
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl.modules import MLP, ProbabilisticActor, TanhNormal
+
+from physai.artifact import FILES, export_policy, onnx
+from physai.artifact.module import make_deployable
+from physai.bench.timing import reacher, table
+from physai.deploy import load_policy
+from physai.deploy.metadata import INPUTS
+from physai.training.run import TrainedPolicy, run_training
+
+FRAMES = 20_480  # what the policy has learnt does not matter
+ROUNDS = 10
+CALLS = 1000
+LOADS = 20
+
+Call = Callable[[], Any]
+
+
+def measure_policy(seed: int) -> tuple[dict[str, np.ndarray], float]:
+    """Return the times of single calls by form, s, and the median time to load a policy file, s."""
+    config = reacher(seed, f"total_frames={FRAMES}", "evaluation.episodes=100")
+    torch.set_num_threads(config.threads)
+    with tempfile.TemporaryDirectory() as folder:
+        run = Path(folder)
+        (run / ".hydra").mkdir()
+        (run / ".hydra" / "config.yaml").write_text(OmegaConf.to_yaml(config.model_dump(mode="json")))
+        run_training(config, run)
+        export_policy(run, "best", list(FILES), episodes=10)
+        loads = [_seconds(lambda: load_policy(run / FILES["torchscript"])) for _ in range(LOADS)]
+        forms = _forms(run)
+        times: dict[str, list[list[float]]] = {name: [] for name in forms}
+        with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
+            for _ in range(ROUNDS + 1):  # they take turns, so that a busy machine slows them alike
+                for name, call in forms.items():
+                    times[name].append([_seconds(call) for _ in range(CALLS)])
+    return {name: np.concatenate(rounds[1:]) for name, rounds in times.items()}, statistics.median(loads)
+
+
+def _forms(run: Path) -> dict[str, Call]:
+    actor, env = TrainedPolicy(run, "best").deploy(1, seed=0)
+    moment = env.reset()
+    inputs = [moment.get(key) for key in INPUTS]
+    arrays = [value[0].numpy() for value in inputs]
+    eager = make_deployable(actor, env)
+    policy = load_policy(run / FILES["torchscript"])
+    runtime = onnx.Runtime((run / FILES["onnx"]).read_bytes())
+    size = sum(moment.get(key).shape[-1] for key in actor.in_keys)
+    stock, seen = _stock_actor(size, len(policy.metadata.joints)), TensorDict({"seen": torch.randn(1, size)}, [1])
+    transforms = list(env.transform)[-2:]  # observation and its normalization
+
+    def pipeline() -> None:
+        tensordict = TensorDict(dict(zip(INPUTS, inputs, strict=True)), [1])
+        for transform in transforms:
+            transform._step(tensordict, tensordict)
+        stock(tensordict.set("seen", torch.cat([tensordict.get(key) for key in actor.in_keys], dim=-1)))
+
+    env.close()
+    return {
+        "TorchRL's stock actor, network alone": lambda: stock(seen),
+        "the same, behind the env's transforms": pipeline,
+        "the artifact, eager": lambda: eager(*inputs),
+        "policy.pt through load_policy, NumPy to NumPy": lambda: policy(*arrays),
+        "policy.onnx in ONNX Runtime": lambda: runtime(*inputs),
+    }
+
+
+def _stock_actor(inputs: int, joints: int) -> ProbabilisticActor:
+    """What TorchRL's tutorials build for PPO, with the sizes of our actor."""
+    network = nn.Sequential(MLP(inputs, 2 * joints, num_cells=[64, 64]), NormalParamExtractor())
+    return ProbabilisticActor(
+        TensorDictModule(network, in_keys=["seen"], out_keys=["loc", "scale"]),
+        in_keys=["loc", "scale"],
+        distribution_class=TanhNormal,
+        return_log_prob=True,
+    )
+
+
+def _seconds(call: Call) -> float:
+    started = time.perf_counter()
+    call()
+    return time.perf_counter() - started
+
+
+def policy_table(times: dict[str, np.ndarray], load: float) -> Table:
+    """Show each form's median and 99th percentile, and the median as a ratio to the first."""
+    shown = table(f"One command for one robot; load_policy takes {load * 1e3:.0f} ms", "", "median", "p99", "ratio")
+    first = np.median(next(iter(times.values())))
+    for name, seconds in times.items():
+        median, slow = np.median(seconds), np.percentile(seconds, 99)
+        shown.add_row(name, f"{median * 1e6:.1f} µs", f"{slow * 1e6:.1f} µs", f"{median / first:.2f}")
+    return shown

@@ -1,0 +1,212 @@
+import math
+
+import numpy as np
+import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
+
+from physai.deploy import ControllerConfig, JointState
+from physai.deploy.joints import JointReader, StateRejected
+
+NAMES = ("joint1", "joint2")
+
+
+@pytest.fixture(scope="module")
+def metadata(policy):
+    return policy.metadata  # two joints, of 2.5 rad/s
+
+
+@pytest.fixture
+def reader(metadata):
+    return JointReader(metadata, ControllerConfig())
+
+
+@pytest.fixture
+def estimating(metadata):
+    return JointReader(metadata, ControllerConfig(allow_velocity_estimate=True))
+
+
+def state(position=(0.1, 0.2), velocity=(0.3, 0.4), stamp=0.0, names=NAMES):
+    return JointState(names, position, velocity, stamp)
+
+
+def rejection(reader, *arguments, implausible=False, **values):
+    with pytest.raises(StateRejected) as caught:
+        reader.read(state(*arguments, **values))
+    assert str(caught.value).startswith("joint state rejected: ")
+    assert caught.value.implausible is implausible
+    return caught.value.kind
+
+
+def assert_reads(reader, joint_state, position, velocity):
+    for read, expected in zip(reader.read(joint_state), (position, velocity), strict=True):
+        assert read.dtype == np.float64
+        np.testing.assert_allclose(read, expected, rtol=1e-9)
+
+
+def test_positions_and_velocities_are_read(reader):
+    assert_reads(reader, state(), [0.1, 0.2], [0.3, 0.4])
+    assert_reads(reader, state(np.array([0.1, 0.2]), np.array([0.3, 0.4]), 0.02, list(NAMES)), [0.1, 0.2], [0.3, 0.4])
+
+
+def test_joints_are_mapped_by_name_and_extra_ones_ignored(reader):
+    names = ("gripper", "joint2", "wheel", "joint1")
+    assert_reads(reader, state((9.0, 0.2, 7.0, 0.1), (5.0, 0.4, 6.0, 0.3), 0.0, names), [0.1, 0.2], [0.3, 0.4])
+
+
+def test_the_order_may_change_from_one_state_to_the_next(reader):
+    assert_reads(reader, state(), [0.1, 0.2], [0.3, 0.4])
+    assert_reads(reader, state((0.2, 0.1), (0.4, 0.3), 0.02, NAMES[::-1]), [0.1, 0.2], [0.3, 0.4])
+    assert rejection(reader, (0.2, 0.1), (0.4, 0.3), 0.04, ("joint1", "joint1")) == "duplicate name"
+    assert_reads(reader, state((0.2, 0.1), (0.4, 0.3), 0.06, NAMES[::-1]), [0.1, 0.2], [0.3, 0.4])
+    assert_reads(reader, state(stamp=0.08), [0.1, 0.2], [0.3, 0.4])
+
+
+def test_what_an_extra_joint_does_is_of_no_concern(reader):
+    names = (*NAMES, "gripper")
+    for stamp, value in enumerate((math.nan, math.inf, 1e9)):
+        assert_reads(reader, state((0.1, 0.2, value), (0.3, 0.4, value), stamp, names), [0.1, 0.2], [0.3, 0.4])
+
+
+@given(st.permutations((("joint1", 0.1, 0.3), ("joint2", 0.2, 0.4), ("a", 1.0, 1.0), ("b", 2.0, 2.0), ("c", 3.0, 3.0))))
+def test_every_order_reads_the_same(metadata, rows):
+    names, position, velocity = zip(*rows, strict=True)
+    joint_reader = JointReader(metadata, ControllerConfig())
+    assert_reads(joint_reader, state(position, velocity, 0.0, names), [0.1, 0.2], [0.3, 0.4])
+
+
+@pytest.mark.parametrize(
+    ("kind", "bad"),
+    {
+        "joint missing": {"names": ("joint1", "joint3")},
+        "joint missing ": {"names": ("joint1",), "position": (0.1,), "velocity": ()},
+        "joint missing  ": {"names": (), "position": (), "velocity": ()},
+        "duplicate name": {"names": ("joint1", "joint1")},
+        "duplicate name ": {"names": (*NAMES, "joint2"), "position": (0.1, 0.2, 0.3), "velocity": ()},
+        "lengths disagree": {"position": (0.1,)},
+        "lengths disagree ": {"position": (0.1, 0.2, 0.3)},
+        "lengths disagree  ": {"position": ((0.1,), (0.2,))},
+        "lengths disagree   ": {"velocity": (0.1,)},
+        "lengths disagree    ": {"velocity": (0.1, 0.2, 0.3)},
+        "malformed": {"position": ("a", "b")},
+        "malformed ": {"velocity": ((0.1,), 0.2)},
+        "position not finite": {"position": (math.nan, 0.2)},
+        "position not finite ": {"position": (0.1, math.inf)},
+        "position not finite  ": {"position": (-math.inf, 0.2)},
+        "stamp not finite": {"stamp": math.nan},
+        "stamp not finite ": {"stamp": math.inf},
+    }.items(),
+)
+def test_a_malformed_state_is_rejected_and_forgotten(reader, kind, bad):
+    assert_reads(reader, state(), [0.1, 0.2], [0.3, 0.4])
+    assert rejection(reader, **{"stamp": 0.01, **bad}) == kind.strip()
+    assert_reads(reader, state(stamp=0.01), [0.1, 0.2], [0.3, 0.4])  # not repeated: the stamp was not taken over
+
+
+@pytest.mark.parametrize("velocity", [(), (math.nan, 0.4), (0.3, math.nan), (math.inf, 0.4), (math.nan, math.nan)])
+def test_without_a_velocity_a_state_is_rejected(reader, velocity):
+    reader.read(state())
+    assert rejection(reader, velocity=velocity, stamp=0.02) == "velocity missing"
+
+
+@pytest.mark.parametrize(
+    ("velocity", "expected"),
+    [
+        ((), [0.5, -0.25]),
+        ((math.nan, math.nan), [0.5, -0.25]),
+        ((0.3, math.nan), [0.3, -0.25]),
+        ((math.inf, 7), [0.5, 7]),
+    ],
+)
+def test_where_allowed_a_missing_velocity_is_estimated_from_positions(estimating, velocity, expected):
+    estimating.read(state())
+    assert_reads(estimating, state((0.11, 0.195), velocity, 0.02), [0.11, 0.195], expected)
+
+
+def test_an_estimate_follows_the_order_of_the_names(estimating):
+    estimating.read(state())
+    assert_reads(
+        estimating, state((0.195, 9.0, 0.11), (), 0.02, ("joint2", "c", "joint1")), [0.11, 0.195], [0.5, -0.25]
+    )
+
+
+def test_an_estimate_needs_a_recent_position(estimating):
+    assert rejection(estimating, velocity=()) == "velocity missing"
+    assert_reads(estimating, state(velocity=(), stamp=0.1), [0.1, 0.2], [0.0, 0.0])
+    assert rejection(estimating, velocity=(), stamp=0.3) == "velocity missing"
+    assert_reads(estimating, state(velocity=(), stamp=0.35), [0.1, 0.2], [0.0, 0.0])
+
+
+def test_the_noise_of_encoders_is_no_motion_to_refuse_however_close_two_states_are(estimating):
+    # FAILS: the check of positions allows 0.01 rad of noise, but at 1 ms its estimate, 9 rad/s, is "implausible".
+    estimating.read(state())
+    estimating.read(state((0.109, 0.2), (), 0.001))
+
+
+@pytest.mark.parametrize("joint", [0, 1])
+@pytest.mark.parametrize("sign", [1, -1])
+def test_a_position_that_jumped_is_implausible(reader, joint, sign):
+    reader.read(state())
+    moved = [0.1, 0.2]
+    moved[joint] += sign * (3 * 2.5 * 0.02 + 0.011)
+    assert rejection(reader, moved, stamp=0.02, implausible=True) == "position jump"
+    assert_reads(reader, state(moved, stamp=0.04), moved, [0.3, 0.4])  # if it stays there, the arm is there
+
+
+def test_how_far_a_joint_can_move_grows_with_time_and_factor(reader, metadata):
+    reader.read(state())
+    assert_reads(reader, state((0.1 + 7.4, 0.2), stamp=1.0), [7.5, 0.2], [0.3, 0.4])
+    strict = JointReader(metadata, ControllerConfig(jump_factor=1.0))
+    strict.read(state())
+    assert rejection(strict, (0.1 + 2.6, 0.2), stamp=1.0, implausible=True) == "position jump"
+
+
+def test_a_stamp_that_repeats_or_runs_backwards_is_implausible(reader):
+    reader.read(state(stamp=5.0))
+    assert rejection(reader, stamp=5.0, implausible=True) == "stamp repeated"
+    assert rejection(reader, stamp=4.99, implausible=True) == "stamp backwards"
+    assert_reads(reader, state(stamp=5.0), [0.1, 0.2], [0.3, 0.4])
+
+
+def test_a_source_whose_clock_was_set_back_is_heard_again_at_the_next_state(reader):
+    reader.read(state(stamp=5000.0))
+    assert rejection(reader, stamp=1.0, implausible=True) == "stamp backwards"
+    assert_reads(reader, state(stamp=1.02), [0.1, 0.2], [0.3, 0.4])
+
+
+@pytest.mark.parametrize("velocity", [(7.6, 0.0), (0.0, -7.6), (1e300, 0.0)])
+def test_a_velocity_that_no_joint_can_have_is_implausible(reader, velocity):
+    assert rejection(reader, velocity=velocity, implausible=True) == "velocity implausible"
+
+
+numbers = st.floats() | st.floats(-1, 1) | st.sampled_from([0.0, 0.1, 1e308, -1e308, 5e-324])
+states = st.builds(
+    JointState,
+    st.sampled_from([NAMES, NAMES[::-1], ("joint1",), ("joint1", "joint1"), ("x", *NAMES), ()]) | st.lists(st.text()),
+    st.lists(numbers, max_size=3),
+    st.lists(numbers, max_size=3),
+    numbers,
+)
+
+
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")
+@given(st.lists(states, max_size=5))
+@example([JointState(NAMES, (0.0, 0.0), (), 0.0), JointState(NAMES, (1e-9, 0.0), (), 5e-324)])
+def test_whatever_comes_is_rejected_or_read_as_finite_plausible_numbers(metadata, messages):
+    joint_reader = JointReader(metadata, ControllerConfig(allow_velocity_estimate=True))
+    for message in messages:
+        try:
+            position, velocity = joint_reader.read(message)
+        except StateRejected as rejected:
+            assert rejected.kind
+            continue
+        assert np.isfinite(position).all()
+        assert (np.abs(velocity) <= 7.5).all()
+
+
+@pytest.mark.parametrize(
+    "bad", [{"names": None}, {"names": [["joint1"], "joint2"]}, {"position": None}, {"velocity": None}, {"stamp": None}]
+)
+def test_a_state_with_parts_that_are_not_lists_or_numbers_is_rejected(reader, bad):
+    # FAILS but for position: TypeError out of read(), and so out of Controller.update(); the last command lives on.
+    rejection(reader, **bad)
