@@ -103,6 +103,12 @@ def test_a_malformed_state_is_rejected_and_forgotten(reader, kind, bad):
     assert_reads(reader, state(stamp=0.01), [0.1, 0.2], [0.3, 0.4])  # not repeated: the stamp was not taken over
 
 
+def test_a_first_state_without_any_joint_is_rejected(reader):
+    # FAILS: "no names" equals the names that a new reader remembers, so that they are never mapped. With velocity=() it
+    # is even read, as arrays of no joints.
+    assert rejection(reader, (), (), 0.0, ()) == "joint missing"
+
+
 @pytest.mark.parametrize("velocity", [(), (math.nan, 0.4), (0.3, math.nan), (math.inf, 0.4), (math.nan, math.nan)])
 def test_without_a_velocity_a_state_is_rejected(reader, velocity):
     reader.read(state())
@@ -197,9 +203,9 @@ def test_whatever_comes_is_rejected_or_read_as_finite_plausible_numbers(metadata
     for message in messages:
         try:
             position, velocity = joint_reader.read(message)
-        except StateRejected as rejected:
-            assert rejected.kind
+        except StateRejected:
             continue
+        assert position.shape == velocity.shape == (2,)
         assert np.isfinite(position).all()
         assert (np.abs(velocity) <= 7.5).all()
 
