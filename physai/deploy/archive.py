@@ -21,7 +21,7 @@ class Archive(NamedTuple):
     """A policy file whose structure is sound.
 
     Attributes:
-        content: The file, as it was read once.
+        content: The checked records as an archive of their own: what may be loaded.
         metadata: Its metadata, not yet parsed.
         content_sha256: Hash of code, weights and constants: of all that ``torch.jit.load`` reads.
     """
@@ -74,7 +74,12 @@ def check(path: Path, content: bytes) -> Archive:
         metadata = records[f"extra/{METADATA}"].decode()
     except UnicodeDecodeError:
         raise PolicyError(f"{path}: {METADATA} is not UTF-8") from None
-    return Archive(content, metadata, _digest(records))
+    return Archive(_rewritten(records), metadata, _digest(records))
+
+
+def tensor_sizes(content: bytes) -> list[int]:
+    """Bytes of each tensor's record in a sound file."""
+    return [len(data) for name, data in _records(content).items() if name.startswith("data/")]
 
 
 def content_sha256(content: bytes) -> str:
@@ -95,10 +100,24 @@ def _records(content: bytes) -> dict[str, bytes]:
             folder, _, name = entry.filename.partition("/")
             if folder != root or name in records or not _RECORD.fullmatch(name):
                 raise PolicyError(f"the archive holds '{entry.filename[:80]}', which no policy has")
-            records[name] = archive.read(entry)  # raises if the checksum is wrong
+            if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+                raise PolicyError(f"'{entry.filename}' is compressed in a way that no policy is")
+            with archive.open(entry) as record:  # raises if the checksum is wrong
+                records[name] = record.read(entry.file_size + 1)  # without a size, up to 1 GiB would be decompressed
+            if len(records[name]) != entry.file_size:
+                raise PolicyError(f"'{entry.filename}' is not as long as the archive says")
             if name.endswith(".py") and b"__setstate__" in records[name]:
                 raise PolicyError(f"'{entry.filename}' would run code while it is loaded")
     return records
+
+
+def _rewritten(records: dict[str, bytes]) -> bytes:
+    """These records and nothing else: a file can be made such that torch finds others in it than Python does."""
+    target = io.BytesIO()
+    with zipfile.ZipFile(target, "w") as archive:
+        for name, data in records.items():
+            archive.writestr(f"archive/{name}", data)
+    return target.getvalue()
 
 
 def _digest(records: dict[str, bytes]) -> str:

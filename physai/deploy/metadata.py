@@ -13,10 +13,15 @@ FORMAT = "physai.policy"
 FORMAT_VERSION = 1
 INPUTS = ("joint_position", "joint_velocity", "goal")
 OUTPUT = "joint_velocity_command"
+MAX_PAIRS = 1000
 
 
 class PolicyError(UserError):
     """A policy file that cannot be trusted or does not fit: one line that says why."""
+
+    def __init__(self, message: str) -> None:
+        # It may quote the file: no line breaks, no control characters for the terminal that shows it.
+        super().__init__("".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in message))
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,14 +66,14 @@ class Metadata:
             PolicyError: If a part is missing, of the wrong shape, or impossible; it says which.
         """
         try:
-            raw = json.loads(text)
+            raw = json.loads(text, parse_constant=_refuse_constant)
         except (ValueError, RecursionError) as error:
             raise PolicyError(f"the metadata is damaged ({str(error)[:80]})") from None
         if not isinstance(raw, dict) or raw.get("format") != FORMAT:
             raise PolicyError("the metadata is not that of a physai policy")
         if raw.get("format_version") != FORMAT_VERSION:
             raise PolicyError(
-                f"format version {raw.get('format_version')!r}; this physai reads {FORMAT_VERSION}: "
+                f"format version {repr(raw.get('format_version'))[:80]}; this physai reads {FORMAT_VERSION}: "
                 "export the policy again with it"
             )
         joints = _get(raw, "robot.joints", list)
@@ -87,8 +92,8 @@ class Metadata:
             if _get(raw, side, dict).get(key) != ["N", size] or len(raw[side]) != (1 if key == OUTPUT else 3):
                 raise PolicyError(f"metadata: {side} must be {[k for k in sizes if (k == OUTPUT) == (key == OUTPUT)]}")
         pairs = len(_get(raw, f"golden.{OUTPUT}", list))
-        if not pairs:
-            raise PolicyError("metadata: there are no golden pairs")
+        if not 0 < pairs <= MAX_PAIRS:
+            raise PolicyError(f"metadata: there are {pairs:,} golden pairs, not 1 to {MAX_PAIRS:,}")
         return cls(
             raw=raw,
             robot=_get(raw, "robot.name", str),
@@ -101,7 +106,7 @@ class Metadata:
             goal_frame=_get(raw, "goal.frame", str),
             goal_radius=(float(inner), float(outer)),
             goal_tolerance=float(_positive(raw, "goal.tolerance", ())),
-            golden={key: _array(raw, f"golden.{key}", (pairs, size)).astype(np.float32) for key, size in sizes.items()},
+            golden={key: _array(raw, f"golden.{key}", (pairs, size), kind=np.float32) for key, size in sizes.items()},
             content_sha256=_get(raw, "content_sha256", str),
         )
 
@@ -117,11 +122,16 @@ def _get(raw: dict[str, Any], key: str, kind: type) -> Any:
     return value
 
 
-def _array(raw: dict[str, Any], key: str, shape: tuple[int, ...], infinite: bool = False) -> np.ndarray:
+def _array(
+    raw: dict[str, Any], key: str, shape: tuple[int, ...], infinite: bool = False, kind: type = np.float64
+) -> np.ndarray:
     value = _get(raw, key, object)
     try:
-        array = np.array(value, dtype=np.float64)
-    except (TypeError, ValueError, OverflowError):
+        if not _all_numbers(value):
+            raise TypeError
+        with np.errstate(over="ignore"):
+            array: np.ndarray = np.array(value, dtype=np.float64).astype(kind)
+    except (TypeError, ValueError, OverflowError, RecursionError):
         raise PolicyError(f"metadata: {key} must hold numbers") from None
     if array.shape != shape:
         raise PolicyError(f"metadata: {key} must have the shape {list(shape)}, not {list(array.shape)}")
@@ -130,6 +140,16 @@ def _array(raw: dict[str, Any], key: str, shape: tuple[int, ...], infinite: bool
     elif not np.isfinite(array).all():
         raise PolicyError(f"metadata: {key} must be finite")
     return array
+
+
+def _all_numbers(value: Any) -> bool:
+    if isinstance(value, list):
+        return all(map(_all_numbers, value))
+    return value is None or (isinstance(value, int | float) and not isinstance(value, bool))
+
+
+def _refuse_constant(name: str) -> None:
+    raise ValueError(f"{name} is no JSON")
 
 
 def _positive(raw: dict[str, Any], key: str, shape: tuple[int, ...]) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 import hashlib
 import io
+import os
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
@@ -9,13 +10,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike
 
 from physai.deploy import archive
 from physai.deploy.metadata import INPUTS, OUTPUT, Metadata, PolicyError
 
 if TYPE_CHECKING:
     from tensordict.nn import TensorDictModule
+
+Vector = Sequence[float] | np.ndarray
 
 # Golden pairs are equal to the last bit where the processor is the one that recorded them; others round differently.
 GOLDEN_TOLERANCE = 1e-4  # rad/s
@@ -41,12 +43,19 @@ class Policy:
         self._position, self._velocity, self._goal = (np.zeros((1, size), np.float32) for size in (n, n, 2))
         self._tensors = [torch.from_numpy(array) for array in (self._position, self._velocity, self._goal)]
 
-    def __call__(self, joint_position: ArrayLike, joint_velocity: ArrayLike, goal: ArrayLike) -> np.ndarray:
-        """Map positions [n] rad, velocities [n] rad/s and a goal [2] m to velocity commands [n], rad/s, float32."""
+    def __call__(self, joint_position: Vector, joint_velocity: Vector, goal: Vector) -> np.ndarray:
+        """Map positions [n] rad, velocities [n] rad/s and a goal [2] m to velocity commands [n], rad/s, float32.
+
+        Raises:
+            ValueError: If one of them has another length.
+        """
+        n = len(self._position[0])
+        if len(joint_position) != n or len(joint_velocity) != n or len(goal) != 2:  # one value would fill all
+            raise ValueError(f"{n} positions, {n} velocities and 2 coordinates of a goal are needed")
         self._position[0], self._velocity[0], self._goal[0] = joint_position, joint_velocity, goal
         return self.module(*self._tensors)[0].numpy()
 
-    def distance(self, joint_position: ArrayLike, goal: ArrayLike) -> float:
+    def distance(self, joint_position: Vector, goal: Vector) -> float:
         """Distance of the end effector to a goal [2] m at joint positions [n] rad, in m."""
         self._position[0], self._goal[0] = joint_position, goal
         return float(self.module.distance(self._tensors[0], self._tensors[2]))
@@ -105,7 +114,7 @@ def load_policy(path: str | Path, sha256: str | None = None, expect_joints: Sequ
 
 def _beside(path: Path) -> tuple[str | None, str]:
     beside = path.with_name(f"{path.name}.sha256")
-    if not beside.exists():
+    if not os.path.lexists(beside):
         return None, ""
     words = archive.read(beside).decode(errors="replace").split()
     return (words[0] if words else ""), f"that of {beside.name}"
@@ -135,6 +144,9 @@ def load_module(content: bytes) -> torch.jit.ScriptModule:
             found = [a.name for a in getattr(module, method).schema.arguments[1:]] if hasattr(module, method) else None
             if found != list(arguments):
                 raise PolicyError(f"its {method} takes {found}, not {list(arguments)}")
+        held = sorted(v.untyped_storage().nbytes() for v in module.state_dict().values())
+        if held != sorted(archive.tensor_sizes(content)):
+            raise PolicyError("its weights are shorter or longer than it says")
         return torch.jit.freeze(module, preserved_attrs=["distance"])
 
 
@@ -147,10 +159,11 @@ def _golden_error(policy: Policy) -> float:
             if command.shape != expected.shape or command.dtype != np.float32:
                 raise PolicyError(f"it gives {command.dtype} {list(command.shape)}, not float32 {list(expected.shape)}")
             policy.distance(inputs[0], inputs[2])
-            worst = max(worst, float(np.abs(command - expected).max()))
-            if not worst <= GOLDEN_TOLERANCE:  # also where it is NaN
+            error = float(np.abs(command - expected).max())
+            if not error <= GOLDEN_TOLERANCE:  # also where it is NaN
                 raise PolicyError(
-                    f"a golden pair differs by {worst:.3g} rad/s: at {[x.tolist() for x in inputs]} it gives "
+                    f"a golden pair differs by {error:.3g} rad/s: at {[x.tolist() for x in inputs]} it gives "
                     f"{command.tolist()}, and gave {expected.tolist()} when it was exported"
                 )
+            worst = max(worst, error)
     return worst

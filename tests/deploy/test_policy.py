@@ -1,5 +1,428 @@
-from physai.deploy import load_policy
+"""Loading a policy: only the file that was exported, for the robot that it was made for, giving the same commands."""
+
+import hashlib
+import io
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from tensordict import TensorDict
+from torch import Tensor, nn
+
+from physai.artifact.module import save
+from physai.deploy import PolicyError, load_policy, read_metadata
+from physai.deploy.archive import content_sha256
+from tests.deploy.test_archive import METADATA, commands, pack, records, refusal, sign
 
 
-def test_loads(exported_run):
-    assert load_policy(exported_run / "policy.pt").golden_error == 0
+@pytest.fixture(scope="module")
+def content(exported_run) -> bytes:
+    return (exported_run / "policy.pt").read_bytes()
+
+
+@pytest.fixture
+def path(tmp_path) -> Path:
+    return tmp_path / "policy.pt"
+
+
+# --- the policy that was exported
+
+
+def test_golden_pairs_are_equal_to_the_last_bit(policy):
+    golden = policy.metadata.golden
+    assert policy.golden_error == 0.0
+    assert np.array_equal(commands(policy, golden), golden["joint_velocity_command"])
+
+
+def test_a_command_is_one_float32_per_joint_and_stays_as_it_is(policy):
+    first = policy([0.1, 0.2], (0.0, 0.0), np.array([0.4, 0.0], np.float64))
+    kept = first.copy()
+    policy([0.3, -0.2], [1.0, 0.0], [0.0, 0.4])
+    assert (first.shape, first.dtype) == ((2,), np.float32)
+    assert np.array_equal(first, kept)
+    assert np.array_equal(first, policy([0.1, 0.2], [0.0, 0.0], [0.4, 0.0]))
+
+
+@pytest.mark.parametrize("wrong", [0.5, [0.5], [[0.5]], [0.1, 0.2, 0.3], [[0.1, 0.2], [0.1, 0.2]], []], ids=repr)
+def test_another_number_of_values_than_joints_is_no_input(policy, wrong):
+    # Fails for 0.5 and [0.5]: `self._position[0] = joint_position` broadcasts one value to all joints.
+    right = [0.1, 0.2]
+    for inputs in ((wrong, right, right), (right, wrong, right), (right, right, wrong)):
+        with pytest.raises((TypeError, ValueError)):
+            policy(*inputs)
+
+
+def test_the_distance_is_that_of_the_arm(policy):
+    reach = policy.distance([0.0, 0.0], [0.0, 0.0])
+    assert reach == pytest.approx(policy.distance([1.0, 0.0], [0.0, 0.0]), abs=1e-5)  # the first joint turns all
+    assert policy.distance([0.0, 0.0], [reach, 0.0]) == pytest.approx(0.0, abs=1e-5)
+    assert policy.distance([0.0, 0.0], [reach - 0.1, 0.0]) == pytest.approx(0.1, abs=1e-5)
+
+
+def test_in_torchrl_code_it_gives_the_same_commands(policy):
+    golden = policy.metadata.golden
+    module = policy.as_tensordict_module()
+    assert module.in_keys == ["joint_position", "joint_velocity", "goal"]
+    assert module.out_keys == ["joint_velocity_command"]
+    one = [
+        TensorDict({key: torch.from_numpy(golden[key][i : i + 1]) for key in module.in_keys}, [1]) for i in range(32)
+    ]
+    alone = torch.cat([module(each)["joint_velocity_command"] for each in one]).numpy()
+    assert np.array_equal(alone, golden["joint_velocity_command"])
+    all_of_them = TensorDict({key: torch.from_numpy(golden[key]) for key in module.in_keys}, [32])
+    together = module(all_of_them)["joint_velocity_command"].numpy()
+    assert np.allclose(together, golden["joint_velocity_command"], rtol=0, atol=1e-5)
+
+
+def test_a_loaded_policy_needs_no_file_any_more(content, path):
+    path.write_bytes(content)
+    policy = load_policy(str(path))
+    path.unlink()
+    assert np.array_equal(commands(policy, policy.metadata.golden), policy.metadata.golden["joint_velocity_command"])
+
+
+# --- its hash
+
+
+def test_the_hash_of_the_file_is_accepted_however_it_is_written(content, path):
+    path.write_bytes(content)
+    digest = hashlib.sha256(content).hexdigest()
+    for text in (digest, digest.upper(), f" {digest}\n"):
+        assert load_policy(path, sha256=text).sha256 == digest
+
+
+@pytest.mark.parametrize(
+    "change", [lambda d: d[::-1], lambda d: d[:16], lambda d: "", lambda d: d + "0", lambda d: "é"]
+)
+def test_another_hash_is_refused(content, path, change):
+    path.write_bytes(content)
+    assert "its SHA-256 is" in refusal(path, sha256=change(hashlib.sha256(content).hexdigest()))
+
+
+def test_the_hash_beside_is_used_unless_another_is_given(content, path):
+    path.write_bytes(content)
+    digest, beside = hashlib.sha256(content).hexdigest(), path.with_name("policy.pt.sha256")
+    beside.write_text(f"{digest}  policy.pt\n")
+    assert load_policy(path).golden_error == 0
+    assert "not the expected one" in refusal(path, sha256="0" * 64)
+    beside.write_text(f"{'0' * 64}  policy.pt\n")
+    assert "not that of policy.pt.sha256, 0000000000000000..." in refusal(path)
+    assert load_policy(path, sha256=digest).golden_error == 0
+
+
+@pytest.mark.parametrize("text", [b" \n", b"\xff\xfe\x00", b"no hash", b"\x1b[2J"])
+def test_a_hash_beside_that_is_none_is_refused(content, path, text):
+    # Fails for \x00 and \x1b: what stands in the file is quoted raw; quote it with !r.
+    path.write_bytes(content)
+    path.with_name("policy.pt.sha256").write_bytes(text)
+    assert "its SHA-256 is" in refusal(path)
+
+
+def test_a_hash_beside_that_is_empty_or_a_folder_is_refused(content, path):
+    path.write_bytes(content)
+    beside = path.with_name("policy.pt.sha256")
+    beside.touch()
+    with pytest.raises(PolicyError, match=r"policy\.pt\.sha256: the file is empty"):
+        load_policy(path)
+    beside.unlink()
+    beside.mkdir()
+    with pytest.raises(PolicyError, match=r"policy\.pt\.sha256: not a file"):
+        load_policy(path)
+
+
+def test_a_hash_beside_that_is_a_dead_link_is_not_passed_over(content, path):
+    # Fails: `beside.exists()` is false for it, and the policy loads unchecked. `os.path.lexists` sees it.
+    path.write_bytes(content)
+    path.with_name("policy.pt.sha256").symlink_to("nowhere")
+    with pytest.raises(PolicyError, match=r"policy\.pt\.sha256: no such file"):
+        load_policy(path)
+
+
+# --- its robot
+
+
+def described(content: bytes, change) -> bytes:
+    """The file with changed metadata."""
+    good = records(content)
+    metadata = json.loads(good[METADATA])
+    change(metadata)
+    return pack(good | {METADATA: json.dumps(metadata).encode()})
+
+
+def test_the_joints_that_are_expected_are_accepted(content, path):
+    path.write_bytes(content)
+    for joints in (("joint1", "joint2"), ["joint1", "joint2"]):
+        assert load_policy(path, expect_joints=joints).metadata.joints == ("joint1", "joint2")
+
+
+def test_swapped_joints_are_called_in_another_order(content, path):
+    path.write_bytes(described(content, lambda metadata: metadata["robot"]["joints"].reverse()))
+    message = refusal(path, expect_joints=["joint1", "joint2"])
+    assert "in another order: ['joint2', 'joint1'], not ['joint1', 'joint2']" in message
+
+
+@pytest.mark.parametrize("joints", [["lbr_joint1", "lbr_joint2"], ["joint1"], ["joint1", "joint2", "joint3"], []])
+def test_another_robots_joints_are_refused(content, path, joints):
+    path.write_bytes(content)
+    assert f"for other joints: ['joint1', 'joint2'], not {joints}" in refusal(path, expect_joints=joints)
+
+
+def test_another_format_version_is_refused_with_the_path(content, path):
+    path.write_bytes(described(content, lambda metadata: metadata.update(format_version=2)))
+    assert "format version 2" in refusal(path)
+
+
+# --- altered weights
+
+
+def altered(content: bytes, name: str, by: float) -> bytes:
+    """The policy, loaded and saved with one weight that differs by so much, and the same metadata."""
+    module = torch.jit.load(io.BytesIO(content))
+    with torch.no_grad():
+        module.state_dict()[name].view(-1)[0] += by
+    return save(module, records(content)[METADATA].decode())
+
+
+WEIGHTS = ("network.0.weight", "network.2.bias", "network.4.weight", "normalizer.loc", "command_limit")
+
+
+@pytest.mark.parametrize("name", WEIGHTS)
+def test_a_weight_that_differs_is_refused(content, path, name):
+    path.write_bytes(altered(content, name, 1e-3))
+    assert "content_sha256 differs" in refusal(path)
+    with pytest.raises(PolicyError, match="content_sha256 differs"):
+        read_metadata(path)
+
+
+@pytest.mark.parametrize("name", [*WEIGHTS, "observation.coarse", "observation.kinematics.constant"])
+def test_a_weight_that_differs_in_a_forged_file_breaks_the_golden_pairs(content, path, name):
+    path.write_bytes(pack(sign(records(altered(content, name, 2e-2)))))
+    assert "a golden pair differs by" in refusal(path)
+
+
+def test_a_weight_that_differs_by_a_thousandth_in_a_forged_file_breaks_the_golden_pairs(content, path):
+    path.write_bytes(pack(sign(records(altered(content, "network.4.bias", 1e-3)))))
+    message = refusal(path)
+    assert "a golden pair differs by" in message
+    assert "when it was exported" in message
+
+
+def test_a_command_that_differs_from_the_golden_one_is_refused(content, path):
+    def change(metadata):
+        metadata["golden"]["joint_velocity_command"][-1][0] += 1e-3
+
+    path.write_bytes(described(content, change))
+    assert "a golden pair differs by 0.001 rad/s" in refusal(path)
+
+
+# --- other modules in the dress of a policy
+
+
+class Base(nn.Module):
+    def __init__(self) -> None:
+        super().__init__()
+        self.weight = nn.Parameter(torch.ones(2), requires_grad=False)
+
+    @torch.jit.export
+    def distance(self, joint_position: Tensor, goal: Tensor) -> Tensor:
+        return torch.linalg.vector_norm(joint_position - goal, dim=1, keepdim=True)
+
+
+class Other(Base):
+    def forward(self, joint_position: Tensor, joint_velocity: Tensor, goal: Tensor) -> Tensor:
+        return joint_position * self.weight
+
+
+class FewerArguments(Base):
+    def forward(self, joint_position: Tensor, goal: Tensor) -> Tensor:
+        return joint_position * self.weight
+
+
+class OtherOrder(Base):
+    def forward(self, joint_velocity: Tensor, joint_position: Tensor, goal: Tensor) -> Tensor:
+        return joint_position * self.weight
+
+
+class OneArgumentMore(Base):
+    def forward(self, joint_position: Tensor, joint_velocity: Tensor, goal: Tensor, gain: float = 1.0) -> Tensor:
+        return joint_position * self.weight * gain
+
+
+class NoDistance(nn.Module):
+    def forward(self, joint_position: Tensor, joint_velocity: Tensor, goal: Tensor) -> Tensor:
+        return joint_position
+
+
+class DistanceIsATensor(nn.Module):
+    def __init__(self) -> None:
+        super().__init__()
+        self.register_buffer("distance", torch.ones(1))
+
+    def forward(self, joint_position: Tensor, joint_velocity: Tensor, goal: Tensor) -> Tensor:
+        return joint_position * self.distance
+
+
+class OtherShape(Base):
+    def forward(self, joint_position: Tensor, joint_velocity: Tensor, goal: Tensor) -> Tensor:
+        return torch.cat([joint_position, goal], dim=1)
+
+
+class OneForAll(Base):
+    def forward(self, joint_position: Tensor, joint_velocity: Tensor, goal: Tensor) -> Tensor:
+        return joint_position[:, :1]
+
+
+class OtherType(Base):
+    def forward(self, joint_position: Tensor, joint_velocity: Tensor, goal: Tensor) -> Tensor:
+        return joint_position.double()
+
+
+class NoTensor(Base):
+    def forward(self, joint_position: Tensor, joint_velocity: Tensor, goal: Tensor) -> float:
+        return float(joint_position[0, 0])
+
+
+class TwoTensors(Base):
+    def forward(self, joint_position: Tensor, joint_velocity: Tensor, goal: Tensor) -> tuple[Tensor, Tensor]:
+        return joint_position, joint_velocity
+
+
+class AllNaN(Base):
+    def forward(self, joint_position: Tensor, joint_velocity: Tensor, goal: Tensor) -> Tensor:
+        return joint_position * float("nan")
+
+
+class OneNaN(Base):
+    def forward(self, joint_position: Tensor, joint_velocity: Tensor, goal: Tensor) -> Tensor:
+        return joint_position.masked_fill(joint_position < 0, float("nan"))
+
+
+class Infinite(Base):
+    def forward(self, joint_position: Tensor, joint_velocity: Tensor, goal: Tensor) -> Tensor:
+        return joint_position / 0.0
+
+
+class Raises(Base):
+    def forward(self, joint_position: Tensor, joint_velocity: Tensor, goal: Tensor) -> Tensor:
+        raise ValueError("first line\nsecond line")
+        return joint_position
+
+
+class LongDistance(Base):
+    def forward(self, joint_position: Tensor, joint_velocity: Tensor, goal: Tensor) -> Tensor:
+        return joint_position
+
+    @torch.jit.export
+    def distance(self, joint_position: Tensor, goal: Tensor) -> Tensor:
+        return joint_position
+
+
+def disguise(module: nn.Module, content: bytes, forged: bool, **changes) -> bytes:
+    """A module with a policy's metadata; forged, they describe it."""
+    scripted = torch.jit.script(module)
+    metadata = json.loads(records(content)[METADATA]) | changes
+    if forged:
+        metadata["content_sha256"] = content_sha256(save(scripted))
+    return save(scripted, json.dumps(metadata))
+
+
+def test_another_module_is_refused(content, path):
+    path.write_bytes(save(torch.jit.script(Other())))
+    assert "a TorchScript file, but no physai policy (metadata.json is missing)" in refusal(path)
+    path.write_bytes(disguise(Other(), content, forged=False))
+    assert "content_sha256 differs" in refusal(path)
+
+
+# Fails for AllNaN: `max(worst, nan)` is worst, so the check for NaN below it never sees one. For instance
+# `error = ...; if not error <= GOLDEN_TOLERANCE: raise`, and only then `worst = max(worst, error)`.
+@pytest.mark.parametrize(
+    ("module", "reason"),
+    [
+        (Other, "a golden pair differs by"),
+        (FewerArguments, "its forward takes ['joint_position', 'goal'], not"),
+        (OtherOrder, "its forward takes ['joint_velocity', 'joint_position', 'goal'], not"),
+        (OneArgumentMore, "its forward takes"),
+        (NoDistance, "its distance takes None, not"),
+        (DistanceIsATensor, ""),
+        (OtherShape, "it gives float32 [4], not float32 [2]"),
+        (OneForAll, "it gives float32 [1], not float32 [2]"),
+        (OtherType, "it gives float64 [2], not float32 [2]"),
+        (NoTensor, "cannot be run"),
+        (TwoTensors, ""),
+        (AllNaN, "a golden pair differs by nan"),
+        (Infinite, "a golden pair differs by inf"),
+        (Raises, "cannot be run"),
+    ],
+)
+def test_another_module_in_a_forged_file_is_refused(content, path, module, reason):
+    path.write_bytes(disguise(module(), content, forged=True))
+    assert reason in refusal(path)
+
+
+def golden_positions(content: bytes) -> dict:
+    """Golden pairs of a policy that commands its positions."""
+    golden = json.loads(records(content)[METADATA])["golden"]
+    return golden | {"joint_velocity_command": golden["joint_position"]}
+
+
+def test_a_forged_file_with_forged_golden_pairs_loads_and_only_its_hash_can_tell(content, path):
+    path.write_bytes(disguise(Other(), content, forged=True, golden=golden_positions(content)))
+    assert load_policy(path).golden_error == 0
+    assert "its SHA-256 is" in refusal(path, sha256=hashlib.sha256(content).hexdigest())
+
+
+def test_a_command_that_is_no_number_in_a_few_of_the_golden_pairs_is_refused(content, path):
+    # Fails, as AllNaN above.
+    path.write_bytes(disguise(OneNaN(), content, forged=True, golden=golden_positions(content)))
+    assert "a golden pair differs by nan" in refusal(path)
+
+
+def test_a_distance_that_is_no_number_is_refused(content, path):
+    path.write_bytes(disguise(LongDistance(), content, forged=True, golden=golden_positions(content)))
+    assert "cannot be run" in refusal(path)
+
+
+# --- what reading metadata does, and what loading imports
+
+
+class Prints(Base):
+    def forward(self, joint_position: Tensor, joint_velocity: Tensor, goal: Tensor) -> Tensor:
+        print("it ran")
+        return joint_position
+
+
+def test_metadata_are_read_without_running_anything(content, path, capfd):
+    path.write_bytes(disguise(Prints(), content, forged=True))
+    assert read_metadata(path).joints == ("joint1", "joint2")
+    assert "it ran" not in capfd.readouterr().out
+    refusal(path)
+    assert "it ran" in capfd.readouterr().out  # so it would have been seen
+
+
+def test_metadata_are_those_of_the_loaded_policy(exported_run, policy):
+    assert read_metadata(exported_run / "policy.pt").raw == policy.metadata.raw
+
+
+def test_a_forged_file_whose_pickle_is_damaged_is_refused(content, path):
+    good = records(content)
+    for at in range(0, len(good["archive/data.pkl"]), 150):
+        path.write_bytes(pack(sign(good | {"archive/data.pkl": good["archive/data.pkl"][:at]})))
+        assert "cannot be run" in refusal(path)
+
+
+IMPORTS = """
+import sys
+import physai.deploy
+print(*sorted({name.partition(".")[0] for name in sys.modules} & set(sys.argv[1:])))
+"""
+
+
+def test_importing_it_imports_nothing_that_a_robot_lacks():
+    heavy = ["tensordict", "torchrl", "pybullet", "hydra", "omegaconf", "pydantic", "gymnasium", "pandas", "scipy"]
+    done = subprocess.run([sys.executable, "-c", IMPORTS, *heavy], capture_output=True, text=True, check=True)
+    # physai registers its environments where Gymnasium is installed, as it is here
+    assert set(done.stdout.split()) <= {"gymnasium"}
