@@ -39,8 +39,10 @@ def _check(node: DictConfig) -> None:
 
     config = _config(node)
     agent = Agent.build(config)
-    script(make_deployable(agent.actor, agent.env))  # what cannot be exported is not worth training
-    agent.close()
+    try:
+        script(make_deployable(agent.actor, agent.env))  # what is no TorchScript could not be exported at the end
+    finally:
+        agent.close()
 
 
 def _train(node: DictConfig, run_dir: Path) -> None:
@@ -77,21 +79,24 @@ def _run(config: "TrainConfig", run_dir: Path, resume: bool) -> None:
     from physai.training.loop import Interrupted
     from physai.training.run import run_training
 
+    complete = (run_dir / "summary.json").is_file()
     try:
         run_training(config, run_dir, resume)
-        _export(run_dir)
+        _export(run_dir, complete)
     except Interrupted as stopped:
         print(f"\nStopped by {stopped}; everything is saved. Go on with:\n  python -m physai.train resume={run_dir}")
         sys.exit(stopped.exit_code)
 
 
-def _export(run_dir: Path) -> None:
+def _export(run_dir: Path, complete: bool) -> None:
+    """Export the best policy, unless a run that was complete before has its files."""
     from physai.artifact import FILES, onnx
     from physai.export import export
 
     lacking = onnx.missing()
     formats = ["torchscript"] if lacking else ["torchscript", "onnx"]
-    if all((run_dir / FILES[name]).exists() for name in formats):  # a complete run was resumed
+    files = [*(FILES[name] for name in formats), f"{FILES['torchscript']}.sha256"]
+    if complete and all((run_dir / name).exists() for name in files):
         return
     export(run_dir, "best", formats)
     if lacking:

@@ -11,7 +11,7 @@ from torch import Tensor
 
 import physai
 from physai.artifact.states import States
-from physai.deploy.metadata import FORMAT, FORMAT_VERSION, INPUTS, OUTPUT
+from physai.deploy.metadata import DISTANCE, FORMAT, FORMAT_VERSION, INPUTS, OUTPUT, UNITS
 from physai.envs.simulation import Simulation
 
 
@@ -27,7 +27,7 @@ def describe_robot(simulation: Simulation) -> dict[str, Any]:
             "end_effector": spec.end_effector,
             "urdf_sha256": hashlib.sha256(spec.urdf.read_bytes()).hexdigest(),
         },
-        "units": {"joint_position": "rad", "joint_velocity": "rad/s", "goal": "m", OUTPUT: "rad/s", "effort": "N m"},
+        "units": UNITS,
         "inputs": {"joint_position": ["N", joints], "joint_velocity": ["N", joints], "goal": ["N", goal]},
         "outputs": {OUTPUT: ["N", joints]},
         "limits": {
@@ -53,8 +53,11 @@ def describe_origin(git_commit: str | None) -> dict[str, Any]:
     }
 
 
-def golden_pairs(states: States, command: Tensor, pairs: int) -> dict[str, Any]:
-    """So many of S states and the commands [S, n] that each gave alone, spread evenly."""
-    rows = torch.linspace(0, len(command) - 1, pairs).long()
-    columns = dict(zip(INPUTS, states, strict=True)) | {OUTPUT: command}
+def golden_pairs(states: States, answers: Tensor, pairs: int) -> dict[str, Any]:
+    """Pick pairs for the loader to try, evenly from S states and the answers [S, n + 1] to them.
+
+    An answer is a command and a distance, asked for at batch 1.
+    """
+    rows = torch.linspace(0, len(answers) - 1, pairs).long()
+    columns = dict(zip(INPUTS, states, strict=True)) | {OUTPUT: answers[:, :-1], DISTANCE: answers[:, -1:]}
     return {key: value[rows].tolist() for key, value in columns.items()}  # doubles hold float32 exactly

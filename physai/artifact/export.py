@@ -10,10 +10,11 @@ import torch
 
 from physai.artifact import describe, gate, onnx
 from physai.artifact.module import make_deployable, save, script
-from physai.artifact.states import States, extremes, visit
-from physai.deploy import Metadata, load_policy
+from physai.artifact.states import States, extreme_states, roll_out
+from physai.deploy import Metadata, PolicyError, load_policy
 from physai.deploy.archive import content_sha256
-from physai.deploy.metadata import INPUTS, OUTPUT
+from physai.deploy.metadata import INPUTS, metadata_sha256
+from physai.deploy.policy import load_module
 from physai.seeding import derive
 from physai.training.checkpoint import write
 from physai.training.run import TrainedPolicy, git_commit
@@ -41,64 +42,77 @@ def export_policy(
         report: Called with the name of each stage that was passed, and how.
         episodes: How many the artifact drives.
 
+    Returns:
+        What the files say about themselves.
+
     Raises:
         GateError: If any two forms of the policy disagree; nothing is written.
         UserError: If there is no such policy, or it cannot be exported.
     """
     trained = TrainedPolicy(run_dir, which)
-    actor, env = trained.deploy(min(episodes, _ROBOTS), SEED)
+    actor, env = trained.deploy(_ROBOTS, SEED)
     try:
         policy = make_deployable(actor, env)
-        moments, edges = visit(actor, env), extremes(env)
-        met = States(*(moments.get(key) for key in INPUTS))
-        states = States(*(torch.cat(pair) for pair in zip(met, edges, strict=True)))
-        tried = f"{len(met.goal):,} states of its work, {len(edges.goal):,} extremes"
-        gate.check_against_env(policy, actor, env, moments, states)
+        rollout, extremes = roll_out(actor, env), extreme_states(env)
+        states = States(*(torch.cat([rollout.get(key), value]) for key, value in zip(INPUTS, extremes, strict=True)))
+        tried = f"{len(rollout):,} states of its work, {len(extremes.goal):,} extremes"
+        gate.check_against_env(policy, actor, env, rollout, states)
         report("the artifact is the policy", f"{tried}: equal to the last bit")
 
         scripted = script(policy)
-        bare = save(scripted)
-        expected = gate.each(policy, states)
-        gate.compare("TorchScript is not the artifact", OUTPUT, gate.each(scripted, states), expected, states)
-        gate.compare("a fresh process disagrees", OUTPUT, gate.run_stranger(bare, states), expected, states)
+        content = save(scripted)
+        expected = gate.answers(policy, states)
+        for stage, found in (
+            ("TorchScript is not the artifact", gate.answers(scripted, states)),
+            ("the loaded file is not the artifact", gate.answers(load_module(content), states)),
+            ("a fresh process disagrees", gate.ask_fresh_process(content, states)),
+        ):
+            gate.compare_answers(stage, found, expected, states)
         report("TorchScript, also in a fresh process", "equal to the last bit")
 
-        converted = onnx.convert(policy, states) if "onnx" in formats else b""
-        if converted:
+        converted = onnx.convert(policy, states) if "onnx" in formats else None
+        if converted is not None:
             worst = gate.check_onnx(onnx.Runtime(converted), expected, states)
             report("ONNX in ONNX Runtime", f"within {worst:.1e} rad/s")
 
-        driven = gate.check_drive(bare, actor, env, episodes, SEED)
+        driven = gate.check_drive(content, actor, env, episodes, SEED)
         report(f"drives {episodes:,} episodes", f"reaches {driven.success_rate:.1%} of the goals, as the policy does")
 
-        content = {
+        described = {
             **describe.describe_origin(git_commit()),
             **describe.describe_robot(env.simulation),
             "checkpoint": {"which": which, "frames": trained.frames},
             "evaluation": {**driven.summary(), "episodes": episodes, "randomization": trained.randomization.name},
             "config": trained.config.model_dump(mode="json"),
-            "golden": describe.golden_pairs(met, expected[: len(met.goal)], GOLDEN_PAIRS),
-            "content_sha256": content_sha256(bare),
+            "golden": describe.golden_pairs(states, expected, GOLDEN_PAIRS),
+            "content_sha256": content_sha256(content),
         }
-        metadata = json.dumps(content, allow_nan=False)
-        final = save(scripted, metadata)
-        checked = _load_as_a_robot_would(final, env.simulation.spec.joints)
-        if converted:
-            described = onnx.describe(converted, metadata)
-            gate.check_onnx(onnx.Runtime(described), expected, states)
-            write(run_dir / FILES["onnx"], described)
+        described["metadata_sha256"] = metadata_sha256(described)
+        text = json.dumps(described, allow_nan=False)
+        final = save(scripted, text)
+        metadata = _load_as_a_robot_would(final)
+        gate.check_metadata(metadata, env.simulation, expected)
+        if converted is not None:
+            final_onnx = onnx.describe(converted, text)
+            gate.check_onnx(onnx.Runtime(final_onnx), expected, states)
+            if onnx.read_metadata(final_onnx) != text:
+                raise gate.GateError("the metadata of the ONNX file is not that of the policy")
+            write(run_dir / FILES["onnx"], final_onnx)
         if "torchscript" in formats:
             _publish(run_dir / FILES["torchscript"], final)
-        return checked
+        return metadata
     finally:
         env.close()
 
 
-def _load_as_a_robot_would(content: bytes, joints: Sequence[str]) -> Metadata:
+def _load_as_a_robot_would(content: bytes) -> Metadata:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / FILES["torchscript"]
         path.write_bytes(content)
-        policy = load_policy(path, hashlib.sha256(content).hexdigest(), joints)
+        try:
+            policy = load_policy(path, hashlib.sha256(content).hexdigest())
+        except PolicyError as error:
+            raise gate.GateError(f"the loader refuses the file: {str(error).removeprefix(f'{path}: ')}") from None
     if policy.golden_error:
         raise gate.GateError(f"the loaded file differs from its golden pairs by {policy.golden_error:.3g} rad/s")
     return policy.metadata

@@ -1,10 +1,12 @@
 """The gate: every form of an exported policy must agree with the policy that was trained."""
 
+import hashlib
 import subprocess
 import sys
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -12,12 +14,13 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
-from physai.artifact import stranger
+from physai.artifact import fresh_process
 from physai.artifact.module import VIEWS, DeployablePolicy
 from physai.artifact.states import States
-from physai.deploy.metadata import INPUTS, OUTPUT
+from physai.deploy.metadata import DISTANCE, INPUTS, OUTPUT, Metadata
 from physai.deploy.policy import load_module
 from physai.envs.make import TransformedRobotEnv
+from physai.envs.simulation import Simulation
 from physai.errors import UserError
 from physai.training.evaluation import Evaluation, evaluate
 from physai.transforms import Observation, ObservationNormalization
@@ -25,6 +28,7 @@ from physai.transforms import Observation, ObservationNormalization
 BATCH_TOLERANCE = 1e-5  # rad/s; a row of a batch is rounded otherwise than the same row alone
 ONNX_TOLERANCE = 1e-5  # rad/s
 SUCCESS_TOLERANCE = 0.01
+PATIENCE = 120  # s
 
 Function = Callable[[Tensor, Tensor, Tensor], Tensor]
 
@@ -60,9 +64,24 @@ def compare(stage: str, what: str, found: Tensor, expected: Tensor, states: Stat
     return worst
 
 
-def each(function: Function, states: States) -> Tensor:
+def one_by_one(function: Function, states: States) -> Tensor:
     """Call a function on one state after the other, as a robot does; stack what it returns."""
     return torch.cat([function(*states.row(index)) for index in range(len(states.goal))])
+
+
+def answers(policy: Any, states: States) -> Tensor:
+    """What a policy, eager or scripted, gives for S states, one by one: [S, n + 1], commands and distances."""
+    return one_by_one(lambda q, qd, goal: torch.cat([policy(q, qd, goal), policy.distance(q, goal)], dim=1), states)
+
+
+def compare_answers(stage: str, found: Tensor, expected: Tensor, states: States) -> None:
+    """Compare answers [S, n + 1] to the last bit.
+
+    Raises:
+        GateError: If a command or a distance differs.
+    """
+    compare(stage, OUTPUT, found[:, :-1], expected[:, :-1], states)
+    compare(stage, DISTANCE, found[:, -1:], expected[:, -1:], states)
 
 
 @torch.no_grad()
@@ -70,28 +89,32 @@ def check_against_env(
     policy: DeployablePolicy,
     actor: TensorDictModuleBase,
     env: TransformedRobotEnv,
-    moments: TensorDictBase,
+    rollout: TensorDictBase,
     states: States,
-) -> float:
+) -> None:
     """The eager artifact against the policy in its environment.
 
-    First on moments of its work: views and command within rounding of what the env showed and the actor did there.
-    Then on all states, one by one, through the env's own transforms: equal to the last bit.
+    First on a rollout: views and command within rounding of what the env showed and the actor did there. Then on all
+    states, one by one, through the env's own transforms: equal to the last bit.
 
-    Returns:
-        Largest difference of a command on ``moments``, rad/s.
+    Args:
+        policy: The artifact.
+        actor: The trained actor.
+        env: Its environment, with the statistics that it was trained with.
+        rollout: States that the actor met there, with all keys of the env and the actions, [R].
+        states: Sensor readings, S of them.
 
     Raises:
         GateError: If anything differs.
     """
     stage = "the artifact is not the policy in its environment"
-    met = States(*(moments.get(key) for key in INPUTS))
+    met = States(*(rollout.get(key) for key in INPUTS))
     for key, view in zip(VIEWS, policy.views(*met), strict=True):
-        scale = moments.get(key).abs().max().clamp(min=1.0)
-        compare(stage, key, view / scale, moments.get(key) / scale, met, BATCH_TOLERANCE)
-    action = moments.get("action").clamp(-1.0, 1.0)
+        scale = rollout.get(key).abs().max().clamp(min=1.0)
+        compare(stage, key, view / scale, rollout.get(key) / scale, met, BATCH_TOLERANCE)
+    action = rollout.get("action").clamp(-1.0, 1.0)
     limit = torch.tensor(env.simulation.config.max_velocity)
-    worst = compare(stage, OUTPUT, policy(*met), action * limit, met, BATCH_TOLERANCE)
+    compare(stage, OUTPUT, policy(*met), action * limit, met, BATCH_TOLERANCE)
 
     transforms = [t for t in env.transform if isinstance(t, Observation | ObservationNormalization)]
     for index in range(len(states.goal)):
@@ -101,14 +124,13 @@ def check_against_env(
             seen = transform._step(seen, seen)
         for key, view in zip(VIEWS, policy.views(*row), strict=True):
             compare(stage, key, view, seen.get(key), row)
-        compare(stage, OUTPUT, policy(*row), actor(seen).get("action") * limit, row)
+        compare(stage, OUTPUT, policy(*row), actor(seen).get("action").clamp(-1.0, 1.0) * limit, row)
         distance = env.simulation.observation.distance(row.joint_position, row.goal)
-        compare(stage, "distance", policy.distance(row.joint_position, row.goal), distance, row)
-    return worst
+        compare(stage, DISTANCE, policy.distance(row.joint_position, row.goal), distance, row)
 
 
-def run_stranger(content: bytes, states: States) -> Tensor:
-    """Commands [S, n] of a TorchScript file in a fresh process that cannot import physai, tensordict or torchrl.
+def ask_fresh_process(content: bytes, states: States) -> Tensor:
+    """Answers [S, n + 1] of a TorchScript file in a fresh process that cannot import physai, tensordict or torchrl.
 
     Raises:
         GateError: If the file does not run there.
@@ -118,24 +140,63 @@ def run_stranger(content: bytes, states: States) -> Tensor:
         policy.write_bytes(content)
         position, velocity, goal = (value.numpy() for value in states)
         np.savez(inputs, joint_position=position, joint_velocity=velocity, goal=goal)
-        command = [sys.executable, "-I", stranger.__file__, str(policy), str(inputs), str(outputs)]
-        process = subprocess.run(command, capture_output=True, text=True)
+        command = [sys.executable, "-I", fresh_process.__file__, str(policy), str(inputs), str(outputs)]
+        try:
+            process = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE)
+        except subprocess.TimeoutExpired:
+            raise GateError(f"a fresh process without physai took longer than {PATIENCE} s") from None
         if process.returncode:
             last = (process.stderr.strip().splitlines() or ["no reason given"])[-1]
             raise GateError(f"a fresh process without physai cannot run the file: {last[:160]}")
         return torch.from_numpy(np.load(outputs))
 
 
+def check_metadata(metadata: Metadata, simulation: Simulation, expected: Tensor) -> None:
+    """What a file says about itself, once it is loaded, against the robot and task that the policy was trained on.
+
+    Args:
+        metadata: Of the loaded file.
+        simulation: Robot and task.
+        expected: Answers [S, n + 1]; no command may be beyond the limit that the file names.
+
+    Raises:
+        GateError: If a part differs; it says which.
+    """
+    spec, config, task = simulation.spec, simulation.config, simulation.task
+    true = {
+        "robot": spec.name,
+        "joints": spec.joints,
+        "position_limit": spec.position_limit,
+        "velocity_limit": spec.velocity_limit,
+        "effort_limit": spec.effort_limit,
+        "command_limit": np.full(len(spec.joints), config.max_velocity),
+        "control_rate": 1.0 / config.control_dt,
+        "goal_frame": spec.base,
+        "goal_radius": task.goal_region,
+        "goal_tolerance": task.tolerance,
+    }
+    for key, value in true.items():
+        said = getattr(metadata, key)
+        if not np.array_equal(said, value):
+            raise GateError(f"the metadata is wrong: {key} is {said}, not {value}")
+    urdf = hashlib.sha256(spec.urdf.read_bytes()).hexdigest()
+    if metadata.raw["robot"]["urdf_sha256"] != urdf:
+        raise GateError("the metadata is wrong: urdf_sha256 is not that of the robot's URDF")
+    largest = expected[:, :-1].abs().amax(dim=0).numpy()
+    if (largest > metadata.command_limit * (1 + 1e-6)).any():
+        raise GateError(f"the policy commands {largest.tolist()} rad/s, beyond its limit {metadata.command_limit}")
+
+
 def check_onnx(runtime: Function, expected: Tensor, states: States) -> float:
-    """Return the largest difference of the commands in ONNX Runtime, one by one and all at once, rad/s.
+    """Return the largest difference of the commands in ONNX Runtime to answers [S, n + 1], in rad/s.
 
     Raises:
         GateError: If it is larger than ``ONNX_TOLERANCE``.
     """
-    stage = "ONNX Runtime disagrees"
+    stage, commands = "ONNX Runtime disagrees", expected[:, :-1]
     return max(
-        compare(f"{stage} ({how})", OUTPUT, found, expected, states, ONNX_TOLERANCE)
-        for how, found in (("one by one", each(runtime, states)), ("in a batch", runtime(*states)))
+        compare(f"{stage} (one by one)", OUTPUT, one_by_one(runtime, states), commands, states, ONNX_TOLERANCE),
+        compare(f"{stage} (in a batch)", OUTPUT, runtime(*states), commands, states, ONNX_TOLERANCE),
     )
 
 

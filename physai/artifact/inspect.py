@@ -5,10 +5,12 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from physai.artifact import onnx
 from physai.deploy import Metadata, PolicyError, archive, read_metadata
+from physai.errors import UserError
 
 
 def show(path: Path) -> None:
@@ -18,23 +20,29 @@ def show(path: Path) -> None:
         PolicyError: If it is no policy file, or damaged.
         UserError: If an ONNX file cannot be read.
     """
-    if path.suffix == ".onnx":
-        text = onnx.read_metadata(archive.read(path))
-        if text is None:
-            raise PolicyError(f"{path}: an ONNX file, but no physai policy")
-        metadata = Metadata.parse(text)
-    else:
-        metadata = read_metadata(path)
+    metadata = _read_onnx(path) if path.suffix == ".onnx" else read_metadata(path)
     console = Console()
     console.print(_summary(path, metadata))
     console.print(_joints(metadata))
     console.print("Config:", json.dumps(metadata.raw.get("config", {}), indent=2), highlight=False, markup=False)
 
 
+def _read_onnx(path: Path) -> Metadata:
+    if onnx.missing():
+        raise UserError(f"ONNX needs {', '.join(onnx.missing())}: pip install 'physai[onnx]'")
+    try:
+        text = onnx.read_metadata(archive.read(path))
+        if text is None:
+            raise PolicyError("an ONNX file, but no physai policy")
+        return Metadata.parse(text)
+    except UserError as error:
+        raise PolicyError(f"{path}: {str(error).removeprefix(f'{path}: ')}") from None
+
+
 def _summary(path: Path, metadata: Metadata) -> Table:
     raw = metadata.raw
-    low, high = raw["evaluation"]["success_ci"]
     evaluation = raw["evaluation"]
+    low, high = evaluation["success_ci"]
     inner, outer = metadata.goal_radius
     rows = {
         "robot": f"{metadata.robot}, end effector {raw['robot']['end_effector']}",
@@ -51,13 +59,13 @@ def _summary(path: Path, metadata: Metadata) -> Table:
         "versions": ", ".join(f"{name} {version}" for name, version in raw["versions"].items()),
         "git commit": str(raw["git_commit"]),
         "created": raw["created"],
-        "code and weights": f"SHA-256 {metadata.content_sha256}",
+        "TorchScript": f"SHA-256 of code and weights {metadata.content_sha256}",
     }
-    table = Table(title=str(path), show_header=False, title_justify="left")
+    table = Table(title=escape(str(path)), show_header=False, title_justify="left")
     table.add_column()
     table.add_column(overflow="fold")  # hashes are worth nothing when they are cut
-    for row in rows.items():
-        table.add_row(*row)
+    for key, value in rows.items():
+        table.add_row(key, escape(value))
     return table
 
 
@@ -72,7 +80,7 @@ def _joints(metadata: Metadata) -> Table:
         metadata.command_limit,
     )
     for name, (lower, upper), velocity, effort, command in zip(metadata.joints, *columns, strict=True):
-        table.add_row(name, f"{lower:g} to {upper:g}", f"{velocity:g}", f"{effort:g}", f"±{command:g}")
+        table.add_row(escape(name), f"{lower:g} to {upper:g}", f"{velocity:g}", f"{effort:g}", f"±{command:g}")
     return table
 
 

@@ -4,6 +4,7 @@ import copy
 import io
 import warnings
 import zipfile
+from typing import Any
 
 import torch
 from tensordict.nn import TensorDictModuleBase
@@ -66,8 +67,15 @@ class DeployablePolicy(TensorDictModuleBase):
         views = self.views(joint_position, joint_velocity, goal)
         return self.network(torch.cat([views[i] for i in self.seen], dim=1)) * self.command_limit
 
+    def __call__(self, *inputs: Any) -> Any:
+        """Act on tensors; or on a TensorDict with ``in_keys``, as other TensorDictModules do."""
+        if len(inputs) != 1:
+            return super().__call__(*inputs)
+        (tensordict,) = inputs
+        return tensordict.set(OUTPUT, super().__call__(*(tensordict.get(key) for key in self.in_keys)))
+
     def views(self, joint_position: Tensor, joint_velocity: Tensor, goal: Tensor) -> list[Tensor]:
-        """What the policy can see, in the order of ``VIEWS``."""
+        """What the policy can see, in the order of ``VIEWS``: [N, 2n + 4], the same, and [N, features]."""
         observation, features = self.observation(joint_position, joint_velocity, goal)
         return [observation, self.normalizer(observation), features]
 

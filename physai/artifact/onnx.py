@@ -4,6 +4,7 @@ import contextlib
 import importlib.util
 import io
 import logging
+import re
 import warnings
 from collections.abc import Iterator
 from typing import Any
@@ -31,6 +32,9 @@ def convert(policy: torch.nn.Module, states: States) -> bytes:
         policy: The module.
         states: Examples of its inputs, at least two.
 
+    Returns:
+        The content of an ONNX file, without metadata.
+
     Raises:
         UserError: If a part of it has no ONNX; it says which.
     """
@@ -47,13 +51,13 @@ def convert(policy: torch.nn.Module, states: States) -> bytes:
                 verbose=False,
             )
         except Exception as error:  # its own hierarchy is private
-            reason = " ".join(str(error).split())[:160]
+            reason = " ".join(re.sub(r"\x1b\[[0-9;]*m", "", str(error)).split())[:160]  # it likes colours
             raise UserError(f"the policy cannot be exported to ONNX ({reason})") from None
         assert program is not None
-        return _lean(program.model_proto).SerializeToString()
+        return _without_notes(program.model_proto).SerializeToString()
 
 
-def _lean(model: Any) -> Any:
+def _without_notes(model: Any) -> Any:
     """Leave out the exporter's notes: they hold stack traces and paths of the machine that trained."""
     graph = model.graph
     for part in (graph, *graph.node, *graph.input, *graph.output, *graph.value_info, *graph.initializer):
@@ -86,15 +90,22 @@ def read_metadata(content: bytes) -> str | None:
 
 
 class Runtime:
-    """The file in ONNX Runtime."""
+    """The file in ONNX Runtime.
+
+    Raises:
+        UserError: If it cannot be run there.
+    """
 
     def __init__(self, content: bytes) -> None:
         import onnxruntime
 
-        self._session = onnxruntime.InferenceSession(content, providers=["CPUExecutionProvider"])
+        try:
+            self._session = onnxruntime.InferenceSession(content, providers=["CPUExecutionProvider"])
+        except Exception as error:  # its classes are private
+            raise UserError(f"ONNX Runtime refuses the file ({' '.join(str(error).split())[:160]})") from None
 
     def __call__(self, joint_position: Tensor, joint_velocity: Tensor, goal: Tensor) -> Tensor:
-        """As the policy."""
+        """Map positions [N, n] rad, velocities [N, n] rad/s and goals [N, 2] m to velocity commands [N, n], rad/s."""
         inputs = zip(INPUTS, (joint_position, joint_velocity, goal), strict=True)
         (output,) = self._session.run([OUTPUT], {key: value.numpy() for key, value in inputs})
         return torch.from_numpy(output)

@@ -35,14 +35,14 @@ class States(NamedTuple):
 
 
 @torch.no_grad()
-def visit(actor: TensorDictModuleBase, env: TransformedRobotEnv) -> TensorDictBase:
-    """Let the policy drive, and return ``ON_POLICY`` moments of it: all keys of the env, and the actions."""
+def roll_out(actor: TensorDictModuleBase, env: TransformedRobotEnv) -> TensorDictBase:
+    """Let the policy drive, and return ``ON_POLICY`` states that it met, with all keys of the env and the actions."""
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         rollout = env.rollout(_STEPS, actor, break_when_any_done=False).reshape(-1)
     return rollout[torch.linspace(0, len(rollout) - 1, ON_POLICY).long()]
 
 
-def extremes(env: TransformedRobotEnv) -> States:
+def extreme_states(env: TransformedRobotEnv) -> States:
     """Corners of the joint limits, far goals and huge velocities, each with each."""
     spec, (_, outer) = env.simulation.spec, env.simulation.task.goal_region
     limits = torch.from_numpy(spec.position_limit).clamp(-_TURNS, _TURNS)

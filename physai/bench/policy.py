@@ -61,7 +61,9 @@ def _forms(run: Path) -> dict[str, Call]:
     policy = load_policy(run / FILES["torchscript"])
     runtime = onnx.Runtime((run / FILES["onnx"]).read_bytes())
     size = sum(moment.get(key).shape[-1] for key in actor.in_keys)
-    stock, seen = _stock_actor(size, len(policy.metadata.joints)), TensorDict({"seen": torch.randn(1, size)}, [1])
+    joints = len(policy.metadata.joints)
+    stock, silent = _stock_actor(size, joints, log_prob=True), _stock_actor(size, joints, log_prob=False)
+    seen = TensorDict({"seen": torch.randn(1, size)}, [1])
     transforms = list(env.transform)[-2:]  # observation and its normalization
 
     def pipeline() -> None:
@@ -73,21 +75,22 @@ def _forms(run: Path) -> dict[str, Call]:
     env.close()
     return {
         "TorchRL's stock actor, network alone": lambda: stock(seen),
-        "the same, behind the env's transforms": pipeline,
+        "the same, without log-probability": lambda: silent(seen),
+        "and behind the env's transforms": pipeline,
         "the artifact, eager": lambda: eager(*inputs),
         "policy.pt through load_policy, NumPy to NumPy": lambda: policy(*arrays),
         "policy.onnx in ONNX Runtime": lambda: runtime(*inputs),
     }
 
 
-def _stock_actor(inputs: int, joints: int) -> ProbabilisticActor:
+def _stock_actor(inputs: int, joints: int, log_prob: bool) -> ProbabilisticActor:
     """What TorchRL's tutorials build for PPO, with the sizes of our actor."""
     network = nn.Sequential(MLP(inputs, 2 * joints, num_cells=[64, 64]), NormalParamExtractor())
     return ProbabilisticActor(
         TensorDictModule(network, in_keys=["seen"], out_keys=["loc", "scale"]),
         in_keys=["loc", "scale"],
         distribution_class=TanhNormal,
-        return_log_prob=True,
+        return_log_prob=log_prob,
     )
 
 

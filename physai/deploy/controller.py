@@ -13,11 +13,14 @@ import numpy as np
 from physai.deploy.goals import Goal, GoalRejected, accept
 from physai.deploy.joints import JointReader, JointState, StateRejected
 from physai.deploy.limits import VelocityLimits
+from physai.deploy.metadata import Metadata
 from physai.deploy.parameters import ControllerConfig
 from physai.deploy.policy import Policy
 from physai.errors import UserError
 
 _LATE = 3.0  # periods
+_STILL = 3  # updates in a row at the same time
+_MOVED = 0.1  # tolerances; a goal that moves by less is still the same
 
 
 class State(enum.Enum):
@@ -31,14 +34,15 @@ class State(enum.Enum):
     ESTOP = "estop"  # zero velocity, until reset
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Command:
     """What to send to the arm.
 
     Attributes:
         velocity: rad/s, in the order of the policy's joints; None: send nothing, the arm has not been heard of yet.
         state: The controller's state.
-        reasons: Why the arm does not do what the policy wants, or what was refused; empty when all is well.
+        reasons: Why the arm stands or is held back, and what was refused; empty when the policy drives, within the
+            limits of velocity and acceleration that always hold.
     """
 
     velocity: np.ndarray | None
@@ -47,10 +51,10 @@ class Command:
 
 
 class Controller:
-    """Drives one robot: call ``update`` at ``config.rate_hz``, and send what it returns.
+    """Drives one robot: call ``update`` at the policy's control rate, and send what it returns.
 
     On any doubt it commands zero velocity: at once, whatever the acceleration limit. From a hold it recovers by
-    itself; from a fault and an emergency stop only by ``reset``.
+    itself; from a fault and an emergency stop only by ``reset``, and a new goal.
 
     Args:
         policy: From :func:`physai.deploy.load_policy`.
@@ -70,17 +74,14 @@ class Controller:
         self.config = config = config or ControllerConfig()
         self.policy = policy
         metadata = policy.metadata
-        slowest = metadata.velocity_limit.min()
-        if config.max_velocity > slowest:
-            raise UserError(f"max_velocity: {config.max_velocity} rad/s is beyond the robot's limit, {slowest:g} rad/s")
-        spans = metadata.position_limit[:, 1] - metadata.position_limit[:, 0]
-        if 2 * config.limit_margin >= spans.min():
-            raise UserError(f"limit_margin: {config.limit_margin} rad leaves no room between the position limits")
+        self._period = 1.0 / metadata.control_rate
+        _check(config, metadata, self._period)
         self._stopwatch = stopwatch
         self._reader = JointReader(metadata, config)
         self._limits = VelocityLimits(metadata, config)
         self._zeros = np.zeros(len(metadata.joints))
         self._now: float | None = None
+        self._still = 0  # updates in a row at that time
         self._position: np.ndarray | None = None
         self._velocity = self._zeros
         self._received = -math.inf
@@ -102,6 +103,9 @@ class Controller:
             now: The time, s, by a clock that does not jump.
             joint_state: A joint state that has come in since the last update.
             goal: A goal that has come in since then; the last good one stays until another comes.
+
+        Returns:
+            Velocities [n] in rad/s, or none before the first joint state; with state and reasons.
         """
         reasons: list[str] = []
         self._counters["updates"] += 1
@@ -109,19 +113,23 @@ class Controller:
         if goal is not None:
             self._take_goal(goal, reasons)
         if joint_state is not None and math.isfinite(now):
-            self._take_state(now, joint_state, reasons)
+            self._take_state(now, joint_state, not stop, reasons)
         if self._position is not None and now - self._received > self.config.state_timeout:
             self._hold("state old", f"the last joint state is {now - self._received:.3f} s old", reasons)
         state = self._state(reasons)
         velocity = self._zeros
-        if state is State.ACTIVE and not stop:
-            velocity = self._drive(elapsed, reasons)
-            state = self._latched or (State.REACHED if self._reached else State.ACTIVE)
+        if state is State.ACTIVE:
+            if not stop:
+                velocity = self._drive(elapsed, reasons)
+            state = State.REACHED if self._reached else State.ACTIVE
+        if self._latched is not None:  # perhaps while the policy was asked
+            velocity, state = self._zeros, self._latched
         if state is not self._command.state:
             self._since = self._now or 0.0
             self._counters[f"entered {state.value}"] += 1
         self._last = velocity
-        self._command = Command(None if self._unheard(state) else velocity.copy(), state, tuple(reasons))
+        unheard = state is State.WAITING and self._position is None
+        self._command = Command(None if unheard else velocity.copy(), state, tuple(reasons))
         return self._command
 
     def emergency_stop(self) -> None:
@@ -130,9 +138,13 @@ class Controller:
         self._latched, self._latch_reason = State.ESTOP, "emergency stop"
 
     def reset(self) -> None:
-        """Leave a fault or an emergency stop for a hold, which ends when the robot is seen to be well."""
+        """Leave a fault or an emergency stop for a hold, which ends when the robot is seen to be well.
+
+        The goal is forgotten: a reset permits motion, a new goal starts it.
+        """
         if self._latched is not None:
             self._latched = None
+            self._goal, self._reached = None, False
             self._failures = 0
             self._needed = self.config.recovery_states
 
@@ -155,20 +167,23 @@ class Controller:
 
     def _take_time(self, now: float, reasons: list[str]) -> tuple[float, bool]:
         """Return the time since the last update, at most a period, and whether this tick must be zero."""
-        period = 1.0 / self.config.rate_hz
         if not math.isfinite(now):
             self._hold("clock", "the time is not finite", reasons)
             return 0.0, True
         before, self._now = self._now, now
-        elapsed = period if before is None else now - before
+        elapsed = self._period if before is None else now - before
+        self._still = 0 if elapsed else self._still + 1
+        if self._still >= _STILL:
+            self._hold("clock", "the clock stands still", reasons)
+            return 0.0, True
         if elapsed < 0 or elapsed > self.config.clock_jump:
             self._hold("clock", f"the clock jumped by {elapsed:.3f} s", reasons)
             return 0.0, True
-        if elapsed > _LATE * period:
+        if elapsed > _LATE * self._period:
             self._counters["late updates"] += 1
-            reasons.append(f"update came after {elapsed:.3f} s, {elapsed / period:.1f} periods")
-            return period, True
-        return min(elapsed, period), False
+            reasons.append(f"update came after {elapsed:.3f} s, {elapsed / self._period:.1f} periods")
+            return self._period, True
+        return min(elapsed, self._period), False
 
     def _take_goal(self, goal: Goal, reasons: list[str]) -> None:
         try:
@@ -178,13 +193,18 @@ class Controller:
             reasons.append(str(rejected))
             return
         self._counters["goals"] += 1
-        if self._goal is None or not np.array_equal(new, self._goal):
-            self._goal, self._reached = new, False
+        if not np.array_equal(new, goal.position):
+            self._counters["goals projected"] += 1
+            reasons.append(f"goal out of reach: {new.tolist()} is the nearest in reach")
+        tolerance = self.policy.metadata.goal_tolerance
+        if self._goal is None or np.abs(new - self._goal).max() > _MOVED * tolerance:
+            self._reached = False
+        self._goal = new
 
-    def _take_state(self, now: float, joint_state: JointState, reasons: list[str]) -> None:
-        received = now if joint_state.received is None else min(joint_state.received, now)
+    def _take_state(self, now: float, joint_state: JointState, timely: bool, reasons: list[str]) -> None:
         try:
-            position, velocity = self._reader.read(joint_state)
+            received = now if joint_state.received is None else min(float(joint_state.received), now)
+            position, velocity = self._reader.read(joint_state, received)
             if not now - received <= self.config.state_timeout:  # also where it is NaN
                 raise StateRejected("old on arrival", f"it is {now - received:.3f} s old", implausible=True)
         except StateRejected as rejected:
@@ -193,16 +213,22 @@ class Controller:
             if rejected.implausible or self._needed:
                 self._needed = self.config.recovery_states
             return
+        except (TypeError, ValueError, OverflowError):
+            self._counters["states rejected: malformed"] += 1
+            reasons.append("joint state rejected: the time of its receipt is no number")
+            return
         self._counters["states"] += 1
         self._position, self._velocity, self._received = position, velocity, received
-        self._needed = max(0, self._needed - 1)
+        if timely:
+            self._needed = max(0, self._needed - 1)
         far = self._limits.far_beyond(position)
         if far is not None and self._latched is None:
             joint = self.policy.metadata.joints[far]
             self._fault("position", f"'{joint}' is far beyond its position limit, at {position[far]:.3f} rad")
 
     def _hold(self, kind: str, reason: str, reasons: list[str]) -> None:
-        self._counters[f"holds: {kind}"] += 1
+        if not self._needed:
+            self._counters[f"holds: {kind}"] += 1
         self._needed = self.config.recovery_states
         reasons.append(reason)
 
@@ -233,12 +259,14 @@ class Controller:
         try:
             tolerance = self.policy.metadata.goal_tolerance
             distance = self.policy.distance(self._position, self._goal)
+            if not 0 <= distance < math.inf:
+                return self._policy_failed("distance", f"gave the distance {distance}", reasons)
             self._reached = distance < tolerance * (self.config.reached_hysteresis if self._reached else 1.0)
             if self._reached:
                 return self._zeros
             wanted = np.asarray(self.policy(self._position, self._velocity, self._goal), dtype=np.float64)
         except Exception as error:  # a policy is a foreign program
-            return self._policy_failed("exception", f"raised {type(error).__name__}: {str(error)[:80]}", reasons)
+            return self._policy_failed("exception", f"raised {type(error).__name__}: {_last_line(error)}", reasons)
         took = self._stopwatch() - started
         if wanted.shape != self._zeros.shape:
             return self._policy_failed("shape", f"gave the shape {list(wanted.shape)}", reasons)
@@ -250,7 +278,11 @@ class Controller:
         if self._limits.out_of_range(wanted):
             self._counters["commands clamped"] += 1
             reasons.append("the policy's command was beyond its range")
-        return self._limits.apply(wanted, self._position, self._last, elapsed)
+        velocity, held_back = self._limits.apply(wanted, self._position, self._last, elapsed)
+        if held_back is not None:
+            self._counters["ticks at a position limit"] += 1
+            reasons.append(held_back)
+        return velocity
 
     def _policy_failed(self, kind: str, what: str, reasons: list[str]) -> np.ndarray:
         self._counters[f"policy failures: {kind}"] += 1
@@ -260,5 +292,25 @@ class Controller:
             self._fault("policy", f"the policy failed {self._failures} times in a row; at last it {what}")
         return self._zeros
 
-    def _unheard(self, state: State) -> bool:
-        return state is State.WAITING and self._position is None
+
+def _last_line(error: Exception) -> str:
+    """What went wrong; TorchScript's errors begin with a traceback."""
+    return (str(error).strip().splitlines() or ["no reason given"])[-1][:80]
+
+
+def _check(config: ControllerConfig, metadata: Metadata, period: float) -> None:
+    slowest = metadata.velocity_limit.min()
+    if config.max_velocity > slowest:
+        raise UserError(f"max_velocity: {config.max_velocity} rad/s is beyond the robot's limit, {slowest:g} rad/s")
+    if config.clock_jump <= _LATE * period:
+        raise UserError(f"clock_jump: must be longer than {_LATE:g} control periods, got {config.clock_jump}")
+    span = (metadata.position_limit[:, 1] - metadata.position_limit[:, 0]).min()
+    if 2 * config.limit_margin >= span:
+        raise UserError(f"limit_margin: {config.limit_margin} rad leaves no room between the position limits")
+    # What the arm may travel until an old joint state stops it, the controller does not see.
+    blind = config.max_velocity * (config.state_timeout + period)
+    if math.isfinite(span) and blind > config.limit_margin:
+        raise UserError(
+            f"limit_margin: at {config.max_velocity} rad/s and a state_timeout of {config.state_timeout} s it must be "
+            f"{blind:.3f} rad at least, got {config.limit_margin}"
+        )

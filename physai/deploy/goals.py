@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from physai.deploy.joints import to_floats
 from physai.deploy.metadata import Metadata
 
 
@@ -36,18 +37,17 @@ def accept(goal: Goal, metadata: Metadata, project: bool) -> np.ndarray:
     Raises:
         GoalRejected: If it is not two finite numbers in the right frame, or out of reach.
     """
-    try:
-        position = np.array(goal.position, dtype=np.float64)
-    except (TypeError, ValueError, OverflowError):
-        raise GoalRejected("malformed", "goal rejected: it is not two numbers") from None
+    position = to_floats(goal.position)
+    if position is None:
+        raise GoalRejected("malformed", "goal rejected: it is not two numbers")
     if position.shape != (2,):
         raise GoalRejected("malformed", f"goal rejected: it has the shape {list(position.shape)}, not [2]")
-    if not np.isfinite(position).all():
+    radius = math.hypot(*position)
+    if not math.isfinite(radius):
         raise GoalRejected("not finite", "goal rejected: it is not finite")
     if goal.frame != metadata.goal_frame:
         raise GoalRejected("wrong frame", f"goal rejected: frame '{goal.frame}' is not '{metadata.goal_frame}'")
     inner, outer = metadata.goal_radius
-    radius = math.hypot(*position)
     # A goal on the very edge, written with fewer digits, is meant to be in.
     if inner - 1e-6 <= radius <= outer + 1e-6:
         return position

@@ -3,7 +3,6 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -61,27 +60,35 @@ class JointReader:
         self._timeout = config.state_timeout
         self._names: tuple[str, ...] = ()
         self._index: list[int] = []
-        self._before: tuple[np.ndarray, float] | None = None
+        self._before: tuple[np.ndarray, float, float] | None = None  # position, stamp, received
 
-    def read(self, state: JointState) -> tuple[np.ndarray, np.ndarray]:
-        """Return positions [n] rad and velocities [n] rad/s.
+    def read(self, state: JointState, received: float) -> tuple[np.ndarray, np.ndarray]:
+        """Return positions [n] rad and velocities [n] rad/s of a state that was received at a time, s.
 
         Raises:
             StateRejected: If it cannot be used, and why.
         """
+        try:
+            return self._read(state, received)
+        except (TypeError, ValueError, OverflowError) as error:  # names, stamps or lists that are none
+            raise StateRejected("malformed", f"it is malformed ({str(error)[:60]})") from None
+
+    def _read(self, state: JointState, received: float) -> tuple[np.ndarray, np.ndarray]:
         names = tuple(state.names)
-        if names != self._names:
+        if names != self._names or not self._index:
             self._index, self._names = self._map(names), names
         position = _numbers(state.position, len(names), "position")[self._index]
         _finite(position, "position")
         velocity = _numbers(state.velocity, len(names), "velocity") if len(state.velocity) else None
-        if not math.isfinite(state.stamp):
+        stamp = float(state.stamp)
+        if not math.isfinite(stamp):
             raise StateRejected("stamp not finite", "its stamp is not finite")
-        before, self._before = self._before, (position, state.stamp)
+        before, self._before = self._before, (position, stamp, received)
         elapsed = 0.0
         if before is not None:
-            elapsed = state.stamp - before[1]
-            self._check_motion(position - before[0], elapsed)
+            elapsed = stamp - before[1]
+            # A source whose stamps run ahead must not make room for jumps.
+            self._check_motion(position - before[0], min(elapsed, max(0.0, received - before[2]) + self._timeout))
         velocity = np.full(len(position), np.nan) if velocity is None else velocity[self._index]
         unknown = ~np.isfinite(velocity)
         if unknown.any():
@@ -89,7 +96,8 @@ class JointReader:
                 raise StateRejected("velocity missing", "a velocity is missing or not finite")
             if before is None or elapsed > self._timeout:
                 raise StateRejected("velocity missing", "a velocity is missing, with no recent position to estimate it")
-            velocity = np.where(unknown, (position - before[0]) / elapsed, velocity)
+            estimate = np.clip((position - before[0]) / elapsed, -self._speed, self._speed)
+            velocity = np.where(unknown, estimate, velocity)
         if (np.abs(velocity) > self._speed).any():
             raise StateRejected("velocity implausible", f"velocities {velocity.tolist()} rad/s cannot be true", True)
         return position, velocity
@@ -114,11 +122,19 @@ class JointReader:
             raise StateRejected("position jump", text, True)
 
 
-def _numbers(values: Sequence[float], count: int, what: str) -> np.ndarray:
+def to_floats(values: Sequence[float]) -> np.ndarray | None:
+    """Return numbers as float64; None if they are no numbers (text is none, whatever it says)."""
     try:
-        array: np.ndarray[Any, Any] = np.array(values, dtype=np.float64)
+        array = np.asarray(values)
     except (TypeError, ValueError, OverflowError):
-        raise StateRejected("malformed", f"its {what} is not a list of numbers") from None
+        return None
+    return array.astype(np.float64) if array.dtype.kind in "fiu" else None
+
+
+def _numbers(values: Sequence[float], count: int, what: str) -> np.ndarray:
+    array = to_floats(values)
+    if array is None:
+        raise StateRejected("malformed", f"its {what} is not a list of numbers")
     if array.shape != (count,):
         raise StateRejected("lengths disagree", f"{count} names, but {what} has the shape {list(array.shape)}")
     return array

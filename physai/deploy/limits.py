@@ -33,8 +33,10 @@ class VelocityLimits:
         """Whether this is more than the policy was trained to command (with room for rounding)."""
         return bool((np.abs(wanted) > self._command * (1 + 1e-6)).any())
 
-    def apply(self, wanted: np.ndarray, position: np.ndarray, last: np.ndarray, elapsed: float) -> np.ndarray:
-        """Return the velocities [n], rad/s, that may be commanded now.
+    def apply(
+        self, wanted: np.ndarray, position: np.ndarray, last: np.ndarray, elapsed: float
+    ) -> tuple[np.ndarray, str | None]:
+        """Return the velocities [n], rad/s, that may be commanded now; and what a position limit had to do with it.
 
         Args:
             wanted: What the policy wants, finite, rad/s.
@@ -44,14 +46,18 @@ class VelocityLimits:
         """
         velocity = np.clip(wanted, -self._command, self._command)
         beyond = ((position < self._lower) | (position > self._upper)).any()
+        reason = "a joint is beyond its position limit: slow" if beyond else None
         fastest, largest = (self._limit_velocity if beyond else self._max_velocity), np.abs(velocity).max()
         if largest > fastest:
             velocity = velocity * (fastest / largest)
         # Outward motion at a limit stops at once, what is wanted as what still goes on.
         highest = np.where(position >= self._inner_upper, 0.0, np.inf)
         lowest = np.where(position <= self._inner_lower, 0.0, -np.inf)
-        velocity = np.clip(velocity, lowest, highest)
-        last = np.clip(last, lowest, highest)
-        change = velocity - last
+        inward = np.clip(velocity, lowest, highest)
+        if reason is None and (inward != velocity).any():
+            reason = "a joint is at its position limit: no motion outward"
+        going, last = last, np.clip(last, lowest, highest)
+        change = inward - last
         allowed, largest = self._max_acceleration * elapsed, np.abs(change).max()
-        return velocity if largest <= allowed else last + change * (allowed / largest)
+        velocity = inward if largest <= allowed else last + change * (allowed / largest)
+        return np.where(going == last, velocity, 0.0), reason

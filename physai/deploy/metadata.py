@@ -1,5 +1,6 @@
 """What a policy file says about itself: which robot, in which order and units, within which limits."""
 
+import hashlib
 import json
 import math
 from dataclasses import dataclass
@@ -13,7 +14,26 @@ FORMAT = "physai.policy"
 FORMAT_VERSION = 1
 INPUTS = ("joint_position", "joint_velocity", "goal")
 OUTPUT = "joint_velocity_command"
+DISTANCE = "distance"  # of the end effector to the goal, which the controller asks for
+UNITS = {
+    "joint_position": "rad",
+    "joint_velocity": "rad/s",
+    "goal": "m",
+    DISTANCE: "m",
+    OUTPUT: "rad/s",
+    "effort": "N m",
+}
 MAX_PAIRS = 1000
+# What a controller does not need, but people do.
+_TOLD = {
+    "robot.urdf_sha256": str,
+    "robot.end_effector": str,
+    "checkpoint": dict,
+    "evaluation": dict,
+    "config": dict,
+    "versions": dict,
+    "created": str,
+}
 
 
 class PolicyError(UserError):
@@ -40,7 +60,8 @@ class Metadata:
         goal_frame: Link in whose frame goals are given.
         goal_radius: Nearest and farthest goal from that frame's origin, m.
         goal_tolerance: Distance that counts as reached, m.
-        golden: Inputs and the output that the policy gave for them when it was exported, one row each, float32.
+        golden: Inputs, and the command and distance that the policy gave for them when it was exported; float32,
+            [pairs, n], [pairs, 2], [pairs, 1].
         content_sha256: Hash of the code and weights that this describes.
     """
 
@@ -71,7 +92,7 @@ class Metadata:
             raise PolicyError(f"the metadata is damaged ({str(error)[:80]})") from None
         if not isinstance(raw, dict) or raw.get("format") != FORMAT:
             raise PolicyError("the metadata is not that of a physai policy")
-        if raw.get("format_version") != FORMAT_VERSION:
+        if raw.get("format_version") is True or raw.get("format_version") != FORMAT_VERSION:
             raise PolicyError(
                 f"format version {repr(raw.get('format_version'))[:80]}; this physai reads {FORMAT_VERSION}: "
                 "export the policy again with it"
@@ -91,10 +112,15 @@ class Metadata:
             side = "outputs" if key == OUTPUT else "inputs"
             if _get(raw, side, dict).get(key) != ["N", size] or len(raw[side]) != (1 if key == OUTPUT else 3):
                 raise PolicyError(f"metadata: {side} must be {[k for k in sizes if (k == OUTPUT) == (key == OUTPUT)]}")
+        if _get(raw, "units", dict) != UNITS:
+            raise PolicyError(f"metadata: units must be {UNITS}")
+        for key, kind in _TOLD.items():
+            _get(raw, key, kind)
         pairs = len(_get(raw, f"golden.{OUTPUT}", list))
         if not 0 < pairs <= MAX_PAIRS:
             raise PolicyError(f"metadata: there are {pairs:,} golden pairs, not 1 to {MAX_PAIRS:,}")
-        return cls(
+        sizes[DISTANCE] = 1
+        found = cls(
             raw=raw,
             robot=_get(raw, "robot.name", str),
             joints=tuple(joints),
@@ -102,13 +128,24 @@ class Metadata:
             velocity_limit=_positive(raw, "limits.velocity", (n,)),
             effort_limit=_positive(raw, "limits.effort", (n,)),
             command_limit=_positive(raw, "limits.command", (n,)),
-            control_rate=float(_positive(raw, "control_rate", ())),
+            control_rate=float(_positive(raw, "control_rate", (), 1e4)),
             goal_frame=_get(raw, "goal.frame", str),
             goal_radius=(float(inner), float(outer)),
-            goal_tolerance=float(_positive(raw, "goal.tolerance", ())),
+            goal_tolerance=float(_positive(raw, "goal.tolerance", (), outer)),
             golden={key: _array(raw, f"golden.{key}", (pairs, size), kind=np.float32) for key, size in sizes.items()},
             content_sha256=_get(raw, "content_sha256", str),
         )
+        if not (found.command_limit <= found.velocity_limit).all():
+            raise PolicyError("metadata: limits.command must not be beyond limits.velocity")
+        if _get(raw, "metadata_sha256", str) != metadata_sha256(raw):
+            raise PolicyError("the metadata is not what was exported (metadata_sha256 differs)")
+        return found
+
+
+def metadata_sha256(raw: dict[str, Any]) -> str:
+    """Hash of the metadata but for the hash itself."""
+    rest = {key: value for key, value in raw.items() if key != "metadata_sha256"}
+    return hashlib.sha256(json.dumps(rest, sort_keys=True).encode()).hexdigest()
 
 
 def _get(raw: dict[str, Any], key: str, kind: type) -> Any:
@@ -152,8 +189,8 @@ def _refuse_constant(name: str) -> None:
     raise ValueError(f"{name} is no JSON")
 
 
-def _positive(raw: dict[str, Any], key: str, shape: tuple[int, ...]) -> np.ndarray:
+def _positive(raw: dict[str, Any], key: str, shape: tuple[int, ...], most: float = math.inf) -> np.ndarray:
     array = _array(raw, key, shape)
-    if not (array > 0).all():
-        raise PolicyError(f"metadata: {key} must be positive")
+    if not ((array > 0) & (array <= most)).all():
+        raise PolicyError(f"metadata: {key} must be positive" + (f", and at most {most:g}" if most < math.inf else ""))
     return array

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from physai.deploy import archive
-from physai.deploy.metadata import INPUTS, OUTPUT, Metadata, PolicyError
+from physai.deploy.metadata import DISTANCE, INPUTS, OUTPUT, Metadata, PolicyError
 
 if TYPE_CHECKING:
     from tensordict.nn import TensorDictModule
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 Vector = Sequence[float] | np.ndarray
 
 # Golden pairs are equal to the last bit where the processor is the one that recorded them; others round differently.
-GOLDEN_TOLERANCE = 1e-4  # rad/s
+GOLDEN_TOLERANCE = 1e-4  # rad/s and m
 
 
 class Policy:
@@ -49,15 +49,19 @@ class Policy:
         Raises:
             ValueError: If one of them has another length.
         """
-        n = len(self._position[0])
-        if len(joint_position) != n or len(joint_velocity) != n or len(goal) != 2:  # one value would fill all
-            raise ValueError(f"{n} positions, {n} velocities and 2 coordinates of a goal are needed")
-        self._position[0], self._velocity[0], self._goal[0] = joint_position, joint_velocity, goal
+        _fill(self._position, joint_position)
+        _fill(self._velocity, joint_velocity)
+        _fill(self._goal, goal)
         return self.module(*self._tensors)[0].numpy()
 
     def distance(self, joint_position: Vector, goal: Vector) -> float:
-        """Distance of the end effector to a goal [2] m at joint positions [n] rad, in m."""
-        self._position[0], self._goal[0] = joint_position, goal
+        """Distance of the end effector to a goal [2] m at joint positions [n] rad, in m.
+
+        Raises:
+            ValueError: If one of them has another length.
+        """
+        _fill(self._position, joint_position)
+        _fill(self._goal, goal)
         return float(self.module.distance(self._tensors[0], self._tensors[2]))
 
     def as_tensordict_module(self) -> "TensorDictModule":
@@ -65,6 +69,12 @@ class Policy:
         from tensordict.nn import TensorDictModule
 
         return TensorDictModule(self.module, in_keys=list(INPUTS), out_keys=[OUTPUT])
+
+
+def _fill(row: np.ndarray, values: Vector) -> None:
+    if len(values) != row.shape[1]:  # NumPy would let one value stand for all
+        raise ValueError(f"{row.shape[1]} values are needed, not {len(values)}")
+    row[0] = values
 
 
 def read_metadata(path: str | Path) -> Metadata:
@@ -88,6 +98,9 @@ def load_policy(path: str | Path, sha256: str | None = None, expect_joints: Sequ
         sha256: Its expected hash, in hexadecimal. Without it, a ``policy.pt.sha256`` that lies beside is used.
         expect_joints: The joints that the robot's side expects, in the policy's order.
 
+    Returns:
+        The policy, warmed up.
+
     Raises:
         PolicyError: If the file is missing, damaged, altered, of another format, or for other joints; it says which.
     """
@@ -99,9 +112,10 @@ def load_policy(path: str | Path, sha256: str | None = None, expect_joints: Sequ
         raise PolicyError(f"{path}: its SHA-256 is {digest[:16]}..., not {source}, {expected.strip()[:16]}...")
     checked = archive.check(path, content)
     metadata = _described(path, checked)
-    if expect_joints is not None and tuple(expect_joints) != metadata.joints:
-        how = "in another order" if set(expect_joints) == set(metadata.joints) else "for other joints"
-        raise PolicyError(f"{path}: a policy {how}: {list(metadata.joints)}, not {list(expect_joints)}")
+    joints = metadata.joints if expect_joints is None else tuple(expect_joints)
+    if joints != metadata.joints:
+        how = "with its joints in another order" if set(joints) == set(metadata.joints) else "for other joints"
+        raise PolicyError(f"{path}: a policy {how}: {list(metadata.joints)}, not {list(joints)}")
     try:
         policy = Policy(load_module(checked.content), metadata, digest)
         policy.golden_error = _golden_error(policy)
@@ -154,11 +168,13 @@ def _golden_error(policy: Policy) -> float:
     """Run all pairs, thrice: the first calls also let TorchScript's profiling executor settle."""
     golden, worst = policy.metadata.golden, 0.0
     for _ in range(3):
-        for *inputs, expected in zip(*(golden[key] for key in (*INPUTS, OUTPUT)), strict=True):
+        for *inputs, (distance,), expected in zip(*(golden[key] for key in (*INPUTS, DISTANCE, OUTPUT)), strict=True):
             command = policy(*inputs)
             if command.shape != expected.shape or command.dtype != np.float32:
                 raise PolicyError(f"it gives {command.dtype} {list(command.shape)}, not float32 {list(expected.shape)}")
-            policy.distance(inputs[0], inputs[2])
+            gap = abs(policy.distance(inputs[0], inputs[2]) - distance)
+            if not gap <= GOLDEN_TOLERANCE:
+                raise PolicyError(f"the distance of a golden pair differs by {gap:.3g} m")
             error = float(np.abs(command - expected).max())
             if not error <= GOLDEN_TOLERANCE:  # also where it is NaN
                 raise PolicyError(

@@ -10,7 +10,7 @@ import torch
 
 from physai.errors import UserError
 
-_FORMAT = 1
+_FORMAT = 2
 
 
 def write(path: Path, content: bytes) -> None:

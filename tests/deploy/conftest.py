@@ -53,6 +53,7 @@ class Troubled:
         return self.seconds
 
     def distance(self, joint_position: np.ndarray, goal: np.ndarray) -> float:
+        self.goal = goal
         self.measured = self.policy.distance(joint_position, goal)
         return self.measured
 

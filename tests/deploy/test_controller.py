@@ -98,18 +98,9 @@ def test_without_a_state_it_waits_and_sends_nothing(robot):
         assert command.reasons == ("no joint state yet",)
 
 
-def test_without_a_good_state_nothing_that_goes_wrong_makes_it_send(robot):
-    for arguments in (
-        {"names": ("a", "b")},
-        {"position": [math.nan, 0.0]},
-        {"after": -50},
-        {"after": 5},
-        {"after": 0.5},
-    ):
-        command = robot.tick(**arguments)
-        assert command.velocity is None or "position" not in arguments
-        robot = Robot(robot.policy.policy)
-        command = robot.tick(state=None, after=arguments.get("after", PERIOD))
+@pytest.mark.parametrize("wrong", [{"names": ("a", "b")}, {"position": (math.nan, 0.0)}, {"after": 5.0, "state": None}])
+def test_before_the_first_good_state_it_sends_nothing_whatever_goes_wrong(robot, wrong):
+    for command in (robot.tick(state=None), *robot.ticks(10, **wrong), robot.tick(after=-50.0, state=None)):
         assert command.velocity is None
         assert command.state is State.WAITING
 
@@ -229,7 +220,7 @@ def test_good_states_that_end_a_hold_come_in_a_row(moving, bad):
     moving.ticks(8, state=None)
     moving.ticks(4)
     assert is_stopped(moving.tick(**bad), State.HOLD)
-    assert recovers(moving, after=6 if bad.keys() == {"velocity"} else 6)
+    assert recovers(moving)
 
 
 # Row: velocity empty or NaN.
@@ -266,6 +257,12 @@ def test_an_implausible_state_is_rejected_and_holds_at_once(moving, kind, bad):
     if kind == "position jump":
         moving.tick()  # the way back is a jump, too
     assert recovers(moving)
+
+
+def test_a_stamp_far_ahead_does_not_make_a_jump_plausible(moving):
+    # FAILS: only the stamps tell how far a joint may have moved. This one says an hour, though it came 0.02 s after the
+    # state before, and the arm drives on from there.
+    assert is_stopped(moving.tick(stamp=moving.now + 3600, position=(-2.0, -2.0)), State.HOLD)
 
 
 @pytest.mark.parametrize("kind", ["stamp repeated", "stamp backwards"])
@@ -319,6 +316,21 @@ def test_a_reset_far_beyond_a_limit_ends_in_the_same_fault(robot):
     robot.controller.reset()
     assert is_stopped(robot.tick(state=None), State.HOLD)
     assert is_stopped(robot.tick(), State.FAULT)
+
+
+def test_a_fast_arm_that_is_not_heard_of_for_a_while_stays_within_its_limits(policy):
+    # FAILS: nothing relates limit_margin to max_velocity. For state_timeout and a period the arm goes on blindly at
+    # 2.0 rad/s from just outside the margin of 0.1 rad, and ends 0.1 rad beyond the limit.
+    robot = Robot(policy, max_velocity=2.0, max_acceleration=50.0)
+    robot.policy.trouble = lambda command: np.array([0.0, 2.0])
+    robot.position = [0.0, 1.0]
+    command = robot.tick(goal=FAR_GOAL)
+    heard = True
+    while command.velocity[1] > 0 or command.state is State.ACTIVE:
+        robot.position[1] += command.velocity[1] * PERIOD
+        heard &= robot.position[1] < 2.46
+        command = robot.tick(velocity=command.velocity) if heard else robot.tick(state=None)
+    assert robot.position[1] <= 2.6
 
 
 # Row: goal NaN, wrong size, wrong frame.
@@ -389,6 +401,15 @@ def test_a_policy_that_fails_now_and_then_is_no_fault_and_starts_from_zero_each_
         moving.policy.trouble = None
         assert np.abs(moving.tick().velocity).max() == pytest.approx(2.0 * PERIOD)
     assert "faults: policy" not in moving.counters
+
+
+def test_after_a_reset_failures_of_the_policy_are_counted_anew(moving):
+    moving.policy.trouble = "NaN"
+    assert is_stopped(moving.ticks(3)[-1], State.FAULT)
+    moving.controller.reset()
+    moving.ticks(4)
+    for state in (State.ACTIVE, State.ACTIVE, State.FAULT):
+        assert is_stopped(moving.tick(), state)
 
 
 def test_a_distance_that_raises_is_a_failure_of_the_policy(moving, monkeypatch):
@@ -548,7 +569,7 @@ def test_nothing_but_a_reset_leaves_an_emergency_stop(moving):
         {"after": 0.5},
         {"after": 50.0},
         {"after": -50.0},
-        {"position": [0.5, 5.0]},
+        *({"position": [0.5, 2.85]},) * 3,
         *({},) * 20,
     ):
         assert is_stopped(moving.tick(**arguments), State.ESTOP)
@@ -604,6 +625,15 @@ def test_a_reached_goal_is_left_only_at_one_and_a_half_tolerances(robot):
     assert states.count(State.ACTIVE) > 10
 
 
+def test_between_one_and_one_and_a_half_tolerances_it_stands_until_the_goal_moves_at_all(robot):
+    x, y = robot.tip()
+    robot.tick(goal=Goal([x, y], "base"))
+    while robot.policy.distance(robot.position, [x, y]) < 0.06:
+        robot.position[0] += 0.01
+        assert is_stopped(robot.tick(goal=Goal([x, y], "base")), State.REACHED)
+    assert robot.tick(goal=Goal([x + 1e-6, y], "base")).state is State.ACTIVE
+
+
 def test_a_hold_at_the_goal_ends_at_the_goal(robot):
     robot.tick(goal=Goal(robot.tip(), "base"))
     assert is_stopped(robot.ticks(7, state=None)[-1], State.HOLD)
@@ -657,7 +687,8 @@ def test_it_brings_the_simulated_arm_to_at_least_9_of_10_goals_within_its_limits
     robots = 10
     simulation = Simulation(reacher, robots, seed=7)
     simulation.reset()
-    controllers = [Controller(policy) for _ in range(robots)]
+    # A stopwatch of its own: on a busy machine a policy now and then takes longer than its 10 ms.
+    controllers = [Controller(policy, stopwatch=lambda: 0.0) for _ in range(robots)]
     limit = policy.metadata.position_limit
     reached, last = np.zeros(robots, dtype=bool), np.zeros((robots, 2))
     for tick in range(round(40 / PERIOD)):

@@ -5,7 +5,7 @@ import warnings
 
 
 def main(policy: str, inputs: str, outputs: str) -> None:
-    """Write what ``policy`` makes of each row of ``inputs`` (.npz) to ``outputs`` (.npy)."""
+    """Write the commands and distances of ``policy`` for each row of ``inputs`` (.npz) to ``outputs`` (.npy)."""
     for name in ("physai", "tensordict", "torchrl"):
         sys.modules[name] = None  # type: ignore[assignment]  # importing them fails from here on
     import numpy as np
@@ -16,7 +16,10 @@ def main(policy: str, inputs: str, outputs: str) -> None:
     module = torch.jit.load(policy)
     given = np.load(inputs)
     columns = [torch.from_numpy(given[key]) for key in ("joint_position", "joint_velocity", "goal")]
-    rows = [module(*(column[i : i + 1] for column in columns)) for i in range(len(columns[0]))]
+    rows = []
+    for index in range(len(columns[0])):
+        position, velocity, goal = (column[index : index + 1] for column in columns)
+        rows.append(torch.cat([module(position, velocity, goal), module.distance(position, goal)], dim=1))
     np.save(outputs, torch.cat(rows).numpy())
 
 
