@@ -22,7 +22,10 @@ def show(path: Path) -> None:
     """
     metadata = _read_onnx(path) if path.suffix == ".onnx" else read_metadata(path)
     console = Console()
-    console.print(_summary(path, metadata))
+    try:
+        console.print(_summary(path, metadata))
+    except (KeyError, TypeError, ValueError) as error:  # of the parts that no robot needs
+        raise PolicyError(f"{path}: the metadata lacks {error}") from None
     console.print(_joints(metadata))
     console.print("Config:", json.dumps(metadata.raw.get("config", {}), indent=2), highlight=False, markup=False)
 

@@ -15,7 +15,9 @@ import physai
 from physai.artifact import export as module
 from physai.artifact import export_policy, gate
 from physai.artifact.inspect import show
-from physai.deploy import load_policy, read_metadata
+from physai.artifact.onnx import describe
+from physai.deploy import load_policy
+from physai.deploy.metadata import metadata_sha256
 from physai.errors import UserError
 from tests.training.small import SMALL, command
 
@@ -87,12 +89,6 @@ def test_golden_pairs_are_full_precision_and_hold_in_both_forms(exported_run):
         np.testing.assert_allclose(command[0], golden["joint_velocity_command"][row], rtol=0, atol=1e-5)
 
 
-def test_the_same_checkpoint_gives_the_same_program(exported_run, copied):
-    before = read_metadata(exported_run / "policy.pt").content_sha256
-    after = export_policy(copied, "best", ["torchscript"], episodes=8)
-    assert after.content_sha256 == before
-
-
 def plant(monkeypatch, defect):
     def make(actor, env):
         policy = make_deployable(actor, env)
@@ -123,7 +119,7 @@ def test_a_file_for_joints_in_another_order_is_refused_before_it_is_written(copi
         return content
 
     monkeypatch.setattr(module.describe, "describe_robot", swapped)
-    with pytest.raises(UserError, match=r"a policy in another order: \['joint2', 'joint1'\]"):
+    with pytest.raises(UserError, match=r"the metadata is wrong: joints is \('joint2', 'joint1'\)"):
         export_policy(copied, "best", ["torchscript", "onnx"], episodes=8)
     assert not list(copied.glob("policy.*"))
 
@@ -144,6 +140,13 @@ def test_each_stage_is_reported(copied):
         assert part in text
 
 
+def test_onnx_metadata_that_are_not_those_of_the_policy_are_refused(copied, monkeypatch):
+    described = module.onnx.describe
+    monkeypatch.setattr(module.onnx, "describe", lambda content, text: described(content, text.replace("joint1", "x")))
+    with pytest.raises(gate.GateError, match="the metadata of the ONNX file is not that of the policy"):
+        export_policy(copied, "best", ["onnx"], episodes=8)
+
+
 @pytest.mark.parametrize("name", ["policy.pt", "policy.onnx"])
 def test_inspect_shows_it_to_people(exported_run, capsys, monkeypatch, name):
     monkeypatch.setenv("COLUMNS", "200")
@@ -151,6 +154,16 @@ def test_inspect_shows_it_to_people(exported_run, capsys, monkeypatch, name):
     shown = capsys.readouterr().out
     for part in ("planar_arm", "joint2", "-2.6 to 2.6", "50 Hz", "0.3 to 0.53 m", "success", "torchrl", '"clip": 10.0'):
         assert part in shown
+
+
+def test_inspect_names_what_people_are_not_told(exported_run, tmp_path):
+    raw = metadata_of(exported_run)
+    del raw["evaluation"]["success_ci"]
+    raw["metadata_sha256"] = metadata_sha256(raw)
+    path = tmp_path / "policy.onnx"
+    path.write_bytes(describe((exported_run / "policy.onnx").read_bytes(), json.dumps(raw)))
+    with pytest.raises(UserError, match=r"policy\.onnx: the metadata lacks 'success_ci'"):
+        show(path)
 
 
 @pytest.mark.slow

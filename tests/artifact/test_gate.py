@@ -1,6 +1,7 @@
 """What is planted in an artifact, the gate finds: at which stage, at which input, how much."""
 
 import copy
+import json
 
 import numpy as np
 import pytest
@@ -9,45 +10,46 @@ from torch import nn
 
 from physai.artifact import gate, onnx
 from physai.artifact.module import make_deployable, save, script
-from physai.artifact.states import ON_POLICY, States, extremes, visit
-from physai.deploy.metadata import INPUTS
+from physai.artifact.states import ON_POLICY, States, extreme_states, roll_out
+from physai.deploy import Metadata, read_metadata
+from physai.deploy.metadata import INPUTS, metadata_sha256
 from physai.training.run import TrainedPolicy
 
 
 @pytest.fixture(scope="module")
 def trained(exported_run):
     actor, env = TrainedPolicy(exported_run, "best").deploy(64, seed=3)
-    moments = visit(actor, env)
-    yield actor, env, moments, States(*(moments.get(key)[::20] for key in INPUTS))
+    rollout = roll_out(actor, env)
+    yield actor, env, rollout, States(*(rollout.get(key)[::20] for key in INPUTS))
     env.close()
 
 
 @pytest.fixture
 def check(trained):
     """Run the first stage on an artifact that something is planted in."""
-    actor, env, moments, states = trained
+    actor, env, rollout, states = trained
     policy = make_deployable(actor, env)
 
     def check(plant=lambda policy: None):
         plant(policy)
-        return gate.check_against_env(policy, actor, env, moments, states)
+        gate.check_against_env(policy, actor, env, rollout, states)
 
     return check
 
 
 def test_the_states_are_those_of_the_policy_at_work(trained):
-    moments = trained[2]
-    assert len(moments) == ON_POLICY >= 1000
-    assert len(torch.unique(moments["goal"], dim=0)) > 64  # episodes end and others begin
-    assert moments["joint_velocity"].abs().max() > 0.5
-    assert (moments["episode_length"] > 0).any()
-    radius = moments["goal"].norm(dim=-1)
+    rollout = trained[2]
+    assert len(rollout) == ON_POLICY >= 1000
+    assert len(torch.unique(rollout["goal"], dim=0)) > 64  # episodes end and others begin
+    assert rollout["joint_velocity"].abs().max() > 0.5
+    assert (rollout["episode_length"] > 0).any()
+    radius = rollout["goal"].norm(dim=-1)
     assert radius.min() >= 0.30 - 1e-6
     assert radius.max() <= 0.53 + 1e-6
 
 
 def test_the_extremes_have_joint_limits_far_goals_and_huge_velocities(trained):
-    states = extremes(trained[1])
+    states = extreme_states(trained[1])
     limits = torch.from_numpy(trained[1].simulation.spec.position_limit).float()
     for joint in range(2):
         for end in limits[joint]:
@@ -58,7 +60,7 @@ def test_the_extremes_have_joint_limits_far_goals_and_huge_velocities(trained):
 
 
 def test_an_artifact_is_equal_to_its_policy(check):
-    assert check() <= gate.BATCH_TOLERANCE
+    check()
 
 
 def tamper_with_a_weight(policy):
@@ -137,14 +139,94 @@ def test_what_is_planted_is_found_and_named(check, plant, what):
     assert "\n" not in message
 
 
+def test_what_is_planted_in_the_scripted_form_alone_is_found(trained):
+    actor, env, _, states = trained
+    policy = make_deployable(actor, env)
+    expected = gate.answers(policy, states)
+    policy.observation.kinematics.constant.mul_(0.999)
+    scripted = script(policy)
+    commands = gate.answers(scripted, states)
+    with pytest.raises(gate.GateError, match="a stage: joint_velocity_command differs by"):
+        gate.compare_answers("a stage", commands, expected, states)
+    commands[:, :-1] = expected[:, :-1]
+    with pytest.raises(gate.GateError, match="a stage: distance differs by"):
+        gate.compare_answers("a stage", commands, expected, states)
+
+
+def swap_limits(raw):
+    raw["limits"]["position"].reverse()
+
+
+def forget_limits(raw):
+    raw["limits"]["position"] = [[None, None]] * 2
+
+
+def raise_the_velocity(raw):
+    raw["limits"]["velocity"] = [100.0, 100.0]
+
+
+def lower_the_command(raw):
+    raw["limits"]["command"] = [0.001, 0.001]
+
+
+def other_rate(raw):
+    raw["control_rate"] = 500.0
+
+
+def other_frame(raw):
+    raw["goal"]["frame"] = "world"
+
+
+def other_ring(raw):
+    raw["goal"]["radius"] = [0.0, 50.0]
+
+
+def other_tolerance(raw):
+    raw["goal"]["tolerance"] = 0.5
+
+
+def other_urdf(raw):
+    raw["robot"]["urdf_sha256"] = "0" * 64
+
+
+@pytest.mark.parametrize(
+    ("plant", "what"),
+    [
+        (lambda raw: raw["robot"]["joints"].reverse(), "joints is"),
+        (swap_limits, "position_limit is"),
+        (forget_limits, "position_limit is"),
+        (raise_the_velocity, "velocity_limit is"),
+        (lower_the_command, "command_limit is"),
+        (other_rate, "control_rate is 500.0, not 50.0"),
+        (other_frame, "goal_frame is world, not base"),
+        (other_ring, "goal_radius is"),
+        (other_tolerance, "goal_tolerance is"),
+        (other_urdf, "urdf_sha256"),
+    ],
+)
+def test_what_is_planted_in_the_metadata_is_found_and_named(trained, exported_run, plant, what):
+    raw = copy.deepcopy(read_metadata(exported_run / "policy.pt").raw)
+    plant(raw)
+    metadata = Metadata.parse(json.dumps(raw | {"metadata_sha256": metadata_sha256(raw)}))
+    with pytest.raises(gate.GateError, match="the metadata is wrong") as refused:
+        gate.check_metadata(metadata, trained[1].simulation, torch.zeros(1, 3))
+    assert what in str(refused.value)
+
+
+def test_a_policy_that_commands_more_than_its_file_says_is_found(trained, exported_run):
+    metadata = read_metadata(exported_run / "policy.pt")
+    with pytest.raises(gate.GateError, match="beyond its limit"):
+        gate.check_metadata(metadata, trained[1].simulation, torch.tensor([[0.0, -2.01, 0.1]]))
+
+
 def test_one_ulp_in_one_weight_is_found_at_batch_one(trained):
-    actor, env, moments, states = trained
+    actor, env, rollout, states = trained
     policy = make_deployable(actor, env)
     with torch.no_grad():
         weight = policy.network[-2].weight
         weight[0, 0] = torch.nextafter(weight[0, 0], torch.tensor(torch.inf))
     with pytest.raises(gate.GateError, match="joint_velocity_command differs by"):
-        gate.check_against_env(policy, actor, env, moments, states)
+        gate.check_against_env(policy, actor, env, rollout, states)
 
 
 def test_a_number_that_is_not_finite_is_a_difference(trained):
@@ -162,19 +244,19 @@ def test_a_number_that_is_not_finite_is_a_difference(trained):
 def test_a_fresh_process_without_physai_gives_the_same_bits(trained):
     actor, env, _, states = trained
     policy = make_deployable(actor, env)
-    found = gate.run_stranger(save(script(policy)), states)
-    assert torch.equal(found, gate.each(policy, states))
+    found = gate.ask_fresh_process(save(script(policy)), states)
+    assert torch.equal(found, gate.answers(policy, states))
 
 
-def test_a_file_that_a_stranger_cannot_run_is_refused(trained):
+def test_a_file_that_a_fresh_process_cannot_run_is_refused(trained):
     with pytest.raises(gate.GateError, match="a fresh process without physai cannot run the file"):
-        gate.run_stranger(b"not a file of torch", trained[3])
+        gate.ask_fresh_process(b"not a file of torch", trained[3])
 
 
 def test_onnx_agrees_and_what_is_planted_in_it_is_found(trained):
     actor, env, _, states = trained
     policy = make_deployable(actor, env)
-    expected = gate.each(policy, states)
+    expected = gate.answers(policy, states)
     content = onnx.convert(policy, states)
     assert gate.check_onnx(onnx.Runtime(content), expected, states) <= 1e-5
     wrong = copy.deepcopy(policy)
