@@ -81,7 +81,7 @@ class TrainedPolicy:
         randomization: How robots differ; None takes the run's own evaluation.
 
     Attributes:
-        frames: How many it had seen.
+        frames: How many the policy had been trained on.
 
     Raises:
         UserError: If there is no such run or checkpoint, or it is damaged.
