@@ -30,7 +30,8 @@ def _check(node: DictConfig) -> None:
 
     config = validate(ExportConfig, node)
     if (config.run is None) == (config.inspect is None):
-        raise UserError("run=<run folder> is needed to export, or inspect=<policy.pt> to look at a policy")
+        either = "run=<run folder> to export, or inspect=<policy.pt> to look at a policy"
+        raise UserError(f"{'not both' if config.run else 'needed'}: {either}")
     if config.run is None:
         return
     if "onnx" in config.formats and onnx.missing():
@@ -57,8 +58,13 @@ def export(run_dir: Path, which: str, formats: list[str]) -> None:
 
     print(f"Exporting the {which} policy of {run_dir}:", flush=True)
     export_policy(run_dir, which, formats, lambda stage, result: print(f"  {stage:<38} {result}", flush=True))
-    for name in formats:
-        print(f"Policy: {run_dir / FILES[name]}")
+    written = [FILES[name] for name in formats]
+    print(
+        f"Written to {run_dir}: {', '.join(written)}{', policy.pt.sha256' if FILES['torchscript'] in written else ''}"
+    )
+    for other in set(FILES.values()) - set(written):
+        if (run_dir / other).exists():
+            print(f"{other} is from an earlier export, perhaps of another checkpoint")
 
 
 if __name__ == "__main__":

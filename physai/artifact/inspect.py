@@ -1,5 +1,6 @@
 """What a policy file says about itself, for people."""
 
+import hashlib
 import json
 from pathlib import Path
 from typing import Any
@@ -22,12 +23,12 @@ def show(path: Path) -> None:
     """
     metadata = _read_onnx(path) if path.suffix == ".onnx" else read_metadata(path)
     console = Console()
+    console.print("Config:", json.dumps(metadata.raw["config"]), highlight=False, markup=False, soft_wrap=True)
     try:
         console.print(_summary(path, metadata))
     except (KeyError, TypeError, ValueError) as error:  # of the parts that no robot needs
         raise PolicyError(f"{path}: the metadata lacks {error}") from None
     console.print(_joints(metadata))
-    console.print("Config:", json.dumps(metadata.raw.get("config", {}), indent=2), highlight=False, markup=False)
 
 
 def _read_onnx(path: Path) -> Metadata:
@@ -62,7 +63,7 @@ def _summary(path: Path, metadata: Metadata) -> Table:
         "versions": ", ".join(f"{name} {version}" for name, version in raw["versions"].items()),
         "git commit": str(raw["git_commit"]),
         "created": raw["created"],
-        "TorchScript": f"SHA-256 of code and weights {metadata.content_sha256}",
+        "file": f"SHA-256 {hashlib.sha256(path.read_bytes()).hexdigest()}",
     }
     table = Table(title=escape(str(path)), show_header=False, title_justify="left")
     table.add_column()

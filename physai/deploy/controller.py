@@ -88,6 +88,7 @@ class Controller:
         self._goal: np.ndarray | None = None
         self._reached = False
         self._needed = 0  # good joint states until a hold ends
+        self._hold_reason = ""
         self._failures = 0  # of the policy, in a row
         self._latched: State | None = None
         self._latch_reason = ""
@@ -115,7 +116,7 @@ class Controller:
         if joint_state is not None and math.isfinite(now):
             self._take_state(now, joint_state, not stop, reasons)
         if self._position is not None and now - self._received > self.config.state_timeout:
-            self._hold("state old", f"the last joint state is {now - self._received:.3f} s old", reasons)
+            reasons.append(self._hold("state old", f"the last joint state is {now - self._received:.3f} s old"))
         state = self._state(reasons)
         velocity = self._zeros
         if state is State.ACTIVE:
@@ -158,6 +159,7 @@ class Controller:
             "reasons": list(self._command.reasons),
             "joint_state_age": at - self._received if known else None,
             "recovery_states_needed": self._needed,
+            "last_hold": self._hold_reason,
             "goal": None if self._goal is None else self._goal.tolist(),
             "velocity": None if self._command.velocity is None else self._command.velocity.tolist(),
             "policy_failures_in_a_row": self._failures,
@@ -168,16 +170,16 @@ class Controller:
     def _take_time(self, now: float, reasons: list[str]) -> tuple[float, bool]:
         """Return the time since the last update, at most a period, and whether this tick must be zero."""
         if not math.isfinite(now):
-            self._hold("clock", "the time is not finite", reasons)
+            reasons.append(self._hold("clock", "the time is not finite"))
             return 0.0, True
         before, self._now = self._now, now
         elapsed = self._period if before is None else now - before
         self._still = 0 if elapsed else self._still + 1
         if self._still >= _STILL:
-            self._hold("clock", "the clock stands still", reasons)
+            reasons.append(self._hold("clock", "the clock stands still"))
             return 0.0, True
         if elapsed < 0 or elapsed > self.config.clock_jump:
-            self._hold("clock", f"the clock jumped by {elapsed:.3f} s", reasons)
+            reasons.append(self._hold("clock", f"the clock jumped by {elapsed:.3f} s"))
             return 0.0, True
         if elapsed > _LATE * self._period:
             self._counters["late updates"] += 1
@@ -210,12 +212,14 @@ class Controller:
         except StateRejected as rejected:
             self._counters[f"states rejected: {rejected.kind}"] += 1
             reasons.append(str(rejected))
-            if rejected.implausible or self._needed:
+            if rejected.implausible:
+                self._hold(rejected.kind, str(rejected))
+            elif self._needed:
                 self._needed = self.config.recovery_states
             return
-        except (TypeError, ValueError, OverflowError):
+        except (TypeError, ValueError, OverflowError, AttributeError):
             self._counters["states rejected: malformed"] += 1
-            reasons.append("joint state rejected: the time of its receipt is no number")
+            reasons.append("joint state rejected: it is none, or the time of its receipt is no number")
             return
         self._counters["states"] += 1
         self._position, self._velocity, self._received = position, velocity, received
@@ -226,11 +230,12 @@ class Controller:
             joint = self.policy.metadata.joints[far]
             self._fault("position", f"'{joint}' is far beyond its position limit, at {position[far]:.3f} rad")
 
-    def _hold(self, kind: str, reason: str, reasons: list[str]) -> None:
+    def _hold(self, kind: str, reason: str) -> str:
         if not self._needed:
             self._counters[f"holds: {kind}"] += 1
         self._needed = self.config.recovery_states
-        reasons.append(reason)
+        self._hold_reason = reason
+        return reason
 
     def _fault(self, kind: str, reason: str) -> None:
         self._counters[f"faults: {kind}"] += 1

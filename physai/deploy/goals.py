@@ -37,7 +37,7 @@ def accept(goal: Goal, metadata: Metadata, project: bool) -> np.ndarray:
     Raises:
         GoalRejected: If it is not two finite numbers in the right frame, or out of reach.
     """
-    position = to_floats(goal.position)
+    position = to_floats(goal.position) if isinstance(goal, Goal) else None
     if position is None:
         raise GoalRejected("malformed", "goal rejected: it is not two numbers")
     if position.shape != (2,):

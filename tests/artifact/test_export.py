@@ -173,7 +173,7 @@ def test_training_the_kuka_leaves_a_policy_and_its_hash(tmp_path):
     assert process.returncode == 0, output
     names = {"policy.pt", "policy.pt.sha256", "policy.onnx"}
     assert names <= {path.name for path in (tmp_path / "run").iterdir()}
-    assert "Policy: run/policy.pt" in output
+    assert "Written to run: policy.pt, policy.onnx, policy.pt.sha256" in output
     policy = load_policy(tmp_path / "run" / "policy.pt", expect_joints=["lbr_iiwa_joint_1", "lbr_iiwa_joint_2"])
     assert policy.metadata.command_limit.tolist() == [0.5, 0.5]
     assert policy.metadata.goal_frame == "lbr_iiwa_link_0"
