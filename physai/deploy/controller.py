@@ -123,8 +123,9 @@ class Controller:
             if not stop:
                 velocity = self._drive(elapsed, reasons)
             state = State.REACHED if self._reached else State.ACTIVE
-        if self._latched is not None:  # perhaps while the policy was asked
+        if self._latched not in (None, state):  # an emergency stop while the policy was asked, or a policy that failed
             velocity, state = self._zeros, self._latched
+            reasons.append(self._latch_reason)
         if state is not self._command.state:
             self._since = self._now or 0.0
             self._counters[f"entered {state.value}"] += 1
@@ -226,7 +227,7 @@ class Controller:
         if timely:
             self._needed = max(0, self._needed - 1)
         far = self._limits.far_beyond(position)
-        if far is not None and self._latched is None:
+        if far is not None and self._latched is not State.FAULT:
             joint = self.policy.metadata.joints[far]
             self._fault("position", f"'{joint}' is far beyond its position limit, at {position[far]:.3f} rad")
 
@@ -238,6 +239,8 @@ class Controller:
         return reason
 
     def _fault(self, kind: str, reason: str) -> None:
+        if self._latched is State.ESTOP:
+            return
         self._counters[f"faults: {kind}"] += 1
         self._latched, self._latch_reason = State.FAULT, reason
 

@@ -31,29 +31,35 @@ FAILURES: dict[str, Callable[[np.ndarray], Any]] = {
     "exception": _raise,
     "slow": lambda command: command,
 }
+DISTANCES = {"distance NaN": math.nan, "distance infinite": math.inf, "distance negative": -0.01}
+ALL_FAILURES = (*FAILURES, *DISTANCES)
 
 
 class Troubled:
-    """A policy that answers as the one inside, unless ``trouble`` is one of FAILURES or a function of its command.
+    """A policy that answers as the one inside, unless ``trouble`` is one of ALL_FAILURES or a function of its command.
 
-    Its stopwatch stands still but for slow answers.
+    With the trouble "emergency stop" it calls ``stop``, too. Its stopwatch stands still but for slow answers.
     """
 
     def __init__(self, policy: Any) -> None:
         self.policy, self.metadata, self.sha256 = policy, policy.metadata, policy.sha256
         self.trouble: str | Callable[[np.ndarray], Any] | None = None
+        self.stop: Callable[[], None] | None = None
         self.seconds = 0.0
         self.forget()
 
     def forget(self) -> None:
         self.measured: float | None = None
-        self.called = self.failed = False
+        self.called = self.failed = self.stopped = False
 
     def stopwatch(self) -> float:
         return self.seconds
 
     def distance(self, joint_position: np.ndarray, goal: np.ndarray) -> float:
         self.goal = goal
+        if self.trouble in DISTANCES:
+            self.failed = True
+            return DISTANCES[self.trouble]
         self.measured = self.policy.distance(joint_position, goal)
         return self.measured
 
@@ -64,6 +70,10 @@ class Troubled:
             return command
         if not isinstance(self.trouble, str):
             return self.trouble(command)
+        if self.trouble == "emergency stop":
+            self.stopped = True
+            self.stop()
+            return command
         self.failed = True
         self.seconds += self.trouble == "slow"
         return FAILURES[self.trouble](command)

@@ -23,8 +23,12 @@ def limits(metadata):
     return VelocityLimits(metadata, ControllerConfig())
 
 
-def apply(limits, wanted, position=MIDDLE, last=STILL, elapsed=EVER):
+def reasoned(limits, wanted, position=MIDDLE, last=STILL, elapsed=EVER):
     return limits.apply(np.array(wanted), np.array(position), np.array(last), elapsed)
+
+
+def apply(*arguments, **keywords):
+    return reasoned(*arguments, **keywords)[0]
 
 
 def test_a_slow_command_in_the_middle_passes_as_it_is(limits):
@@ -59,10 +63,23 @@ def test_outward_motion_at_a_limit_stops_at_once_whatever_the_acceleration_limit
 
 
 def test_a_joint_that_turns_at_a_limit_stops_first(limits):
-    # FAILS: from 0.3 outward to 0.04 inward in one tick, a change of 0.34 rad/s where 0.04 is allowed: the stop and the
-    # first step of the way back come in the same tick.
-    velocity = apply(limits, [0.0, -0.3], [0.0, 2.5], [0.0, 0.3], PERIOD)
-    assert velocity[1] == 0.0 or abs(velocity[1] - 0.3) <= 2.0 * PERIOD + 1e-9
+    velocity = apply(limits, [0.3, -0.3], [0.0, 2.5], [0.0, 0.3], PERIOD)
+    np.testing.assert_allclose(velocity, [0.04, 0.0])
+    np.testing.assert_allclose(apply(limits, [0.0, -0.3], [0.0, 2.5], STILL, PERIOD), [0.0, -0.04])
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_a_position_limit_that_acts_is_named(limits, sign):
+    outward, inward, inside = [0.2, sign * 0.2], [0.2, -sign * 0.2], [0.0, sign * 2.55]
+    assert reasoned(limits, [2.0, sign * 2.0], elapsed=PERIOD)[1] is None
+    assert reasoned(limits, inward, inside)[1] is None
+    assert reasoned(limits, outward, inside)[1] == "a joint is at its position limit: no motion outward"
+    for wanted in (outward, inward, STILL):
+        assert reasoned(limits, wanted, [0.0, sign * 2.65])[1] == "a joint is beyond its position limit: slow"
+
+
+def test_a_position_limit_that_stops_a_joint_that_shall_turn_is_named_too(limits):
+    assert reasoned(limits, [0.0, -0.3], [0.0, 2.5], [0.0, 0.3], PERIOD)[1] is not None
 
 
 def test_velocities_change_by_no_more_than_the_acceleration_limit_allows(limits):
@@ -120,9 +137,9 @@ def test_whatever_is_wanted_the_limits_hold(limits, wanted, position, last, elap
     assert np.isfinite(velocity).all()
     assert (np.abs(velocity) <= 0.3 * (1 + 1e-12)).all()
     for joint, limit in enumerate((6.2832, 2.6)):
-        if position[joint] >= limit - 0.1:
-            assert velocity[joint] <= 0
-        elif position[joint] <= -limit + 0.1:
-            assert velocity[joint] >= 0
+        side = (position[joint] >= limit - 0.1) - (position[joint] <= -limit + 0.1)
+        assert velocity[joint] * side <= 0
+        if last[joint] * side > 0:
+            assert velocity[joint] == 0
         else:
             assert abs(velocity[joint] - last[joint]) <= 2.0 * elapsed + 1e-12
