@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from physai.deploy.goals import Goal, GoalRejected, accept
-from physai.deploy.joints import JointReader, JointState, StateRejected
+from physai.deploy.joints import JointReader, JointState, StateRejected, to_float
 from physai.deploy.limits import VelocityLimits
 from physai.deploy.metadata import Metadata
 from physai.deploy.parameters import ControllerConfig
@@ -206,21 +206,18 @@ class Controller:
 
     def _take_state(self, now: float, joint_state: JointState, timely: bool, reasons: list[str]) -> None:
         try:
-            received = now if joint_state.received is None else min(float(joint_state.received), now)
+            received = now if joint_state.received is None else min(to_float(joint_state.received), now)
             position, velocity = self._reader.read(joint_state, received)
             if not now - received <= self.config.state_timeout:  # also where it is NaN
                 raise StateRejected("old on arrival", f"it is {now - received:.3f} s old", implausible=True)
-        except StateRejected as rejected:
+        except (StateRejected, AttributeError) as error:
+            rejected = error if isinstance(error, StateRejected) else StateRejected("malformed", "it is none")
             self._counters[f"states rejected: {rejected.kind}"] += 1
             reasons.append(str(rejected))
             if rejected.implausible:
                 self._hold(rejected.kind, str(rejected))
             elif self._needed:
                 self._needed = self.config.recovery_states
-            return
-        except (TypeError, ValueError, OverflowError, AttributeError):
-            self._counters["states rejected: malformed"] += 1
-            reasons.append("joint state rejected: it is none, or the time of its receipt is no number")
             return
         self._counters["states"] += 1
         self._position, self._velocity, self._received = position, velocity, received
@@ -315,10 +312,10 @@ def _check(config: ControllerConfig, metadata: Metadata, period: float) -> None:
     span = (metadata.position_limit[:, 1] - metadata.position_limit[:, 0]).min()
     if 2 * config.limit_margin >= span:
         raise UserError(f"limit_margin: {config.limit_margin} rad leaves no room between the position limits")
-    # What the arm may travel until an old joint state stops it, the controller does not see.
-    blind = config.max_velocity * (config.state_timeout + period)
-    if math.isfinite(span) and blind > config.limit_margin:
+    # What the arm may travel until an old joint state stops it, and an update that is just not late sees that.
+    blind = config.max_velocity * (config.state_timeout + _LATE * period)
+    if np.isfinite(metadata.position_limit).any() and blind > config.limit_margin + 1e-9:
         raise UserError(
             f"limit_margin: at {config.max_velocity} rad/s and a state_timeout of {config.state_timeout} s it must be "
-            f"{blind:.3f} rad at least, got {config.limit_margin}"
+            f"{math.ceil(blind * 1e3 - 1e-6) / 1e3:.3f} rad at least, got {config.limit_margin}"
         )

@@ -80,7 +80,7 @@ class JointReader:
         position = _numbers(state.position, len(names), "position")[self._index]
         _finite(position, "position")
         velocity = _numbers(state.velocity, len(names), "velocity") if len(state.velocity) else None
-        stamp = float(state.stamp)
+        stamp = to_float(state.stamp)
         if not math.isfinite(stamp):
             raise StateRejected("stamp not finite", "its stamp is not finite")
         before, self._before = self._before, (position, stamp, received)
@@ -120,6 +120,18 @@ class JointReader:
             joint = int(far.argmax())
             text = f"'{self._joints[joint]}' jumped by {moved[joint]:.3f} rad in {elapsed:.3f} s"
             raise StateRejected("position jump", text, True)
+
+
+def to_float(value: float) -> float:
+    """Return a time as a float.
+
+    Raises:
+        StateRejected: If it is no number.
+    """
+    array = to_floats(value)  # type: ignore[arg-type]
+    if array is None or array.shape:
+        raise StateRejected("malformed", "its stamp, or the time of its receipt, is no number")
+    return float(array)
 
 
 def to_floats(values: Sequence[float]) -> np.ndarray | None:

@@ -54,9 +54,9 @@ class VelocityLimits:
         highest = np.where(position >= self._inner_upper, 0.0, np.inf)
         lowest = np.where(position <= self._inner_lower, 0.0, -np.inf)
         inward = np.clip(velocity, lowest, highest)
-        if reason is None and (inward != velocity).any():
-            reason = "a joint is at its position limit: no motion outward"
         going, last = last, np.clip(last, lowest, highest)
+        if reason is None and ((inward != velocity) | (going != last)).any():
+            reason = "a joint is at its position limit: no motion outward"
         change = inward - last
         allowed, largest = self._max_acceleration * elapsed, np.abs(change).max()
         velocity = inward if largest <= allowed else last + change * (allowed / largest)

@@ -332,7 +332,7 @@ def test_a_reset_far_beyond_a_limit_ends_in_the_same_fault(robot):
 @pytest.mark.parametrize("timeout", [0.1, 0.4])
 @pytest.mark.parametrize("speed", [0.3, 2.0])
 def test_an_arm_that_is_not_heard_of_for_a_while_stays_within_its_limits(policy, speed, timeout):
-    margin = speed * (timeout + PERIOD) + 1e-6
+    margin = speed * (timeout + 3 * PERIOD) + 1e-6
     robot = Robot(policy, max_velocity=speed, max_acceleration=50.0, state_timeout=timeout, limit_margin=margin)
     robot.policy.trouble = lambda command: np.array([0.0, 2.0])
     robot.position = [0.0, 1.0]
