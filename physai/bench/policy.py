@@ -78,11 +78,11 @@ def _forms(run: Path) -> dict[str, Call]:
 
     env.close()
     return {
-        "TorchRL's stock actor, network alone": lambda: stock(seen),
-        "the same, without log-probability": lambda: silent(seen),
-        "and behind the env's transforms": pipeline,
-        "the artifact, eager": lambda: eager(*inputs),
-        "policy.pt through load_policy, NumPy to NumPy": lambda: policy(*arrays),
+        "TorchRL's stock actor": lambda: stock(seen),
+        "... without log-probability": lambda: silent(seen),
+        "... behind the env's transforms": pipeline,
+        "artifact, eager": lambda: eager(*inputs),
+        "policy.pt, NumPy to NumPy": lambda: policy(*arrays),
         "policy.onnx in ONNX Runtime": lambda: runtime(*inputs),
     }
 
@@ -107,7 +107,7 @@ def _seconds(call: Call) -> float:
 def policy_table(times: dict[str, np.ndarray], load: float) -> Table:
     """Show each form's median and 99th percentile, and the median as a ratio to the first."""
     shown = table(
-        f"One command for one robot; load_policy takes {load * 1e3:.0f} ms", "", "median", "p99", "time, of the first"
+        f"One command for one robot; load_policy takes {load * 1e3:.0f} ms", "", "median", "p99", "ratio"
     )
     first = np.median(next(iter(times.values())))
     for name, seconds in times.items():
