@@ -106,9 +106,7 @@ def _seconds(call: Call) -> float:
 
 def policy_table(times: dict[str, np.ndarray], load: float) -> Table:
     """Show each form's median and 99th percentile, and the median as a ratio to the first."""
-    shown = table(
-        f"One command for one robot; load_policy takes {load * 1e3:.0f} ms", "", "median", "p99", "ratio"
-    )
+    shown = table(f"One command for one robot; load_policy takes {load * 1e3:.0f} ms", "", "median", "p99", "ratio")
     first = np.median(next(iter(times.values())))
     for name, seconds in times.items():
         median, slow = np.median(seconds), np.percentile(seconds, 99)

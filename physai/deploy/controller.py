@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from physai.deploy.goals import Goal, GoalRejected, accept
-from physai.deploy.joints import JointReader, JointState, StateRejected, to_float
+from physai.deploy.goals import Goal, GoalError, accept
+from physai.deploy.joints import JointReader, JointState, JointStateError, to_float
 from physai.deploy.limits import VelocityLimits
 from physai.deploy.metadata import Metadata
 from physai.deploy.parameters import ControllerConfig
@@ -191,7 +191,7 @@ class Controller:
     def _take_goal(self, goal: Goal, reasons: list[str]) -> None:
         try:
             new = accept(goal, self.policy.metadata, self.config.unreachable_goal == "project")
-        except GoalRejected as rejected:
+        except GoalError as rejected:
             self._counters[f"goals rejected: {rejected.kind}"] += 1
             reasons.append(str(rejected))
             return
@@ -209,9 +209,9 @@ class Controller:
             received = now if joint_state.received is None else min(to_float(joint_state.received), now)
             position, velocity = self._reader.read(joint_state, received)
             if not now - received <= self.config.state_timeout:  # also where it is NaN
-                raise StateRejected("old on arrival", f"it is {now - received:.3f} s old", implausible=True)
-        except (StateRejected, AttributeError) as error:
-            rejected = error if isinstance(error, StateRejected) else StateRejected("malformed", "it is none")
+                raise JointStateError("old on arrival", f"it is {now - received:.3f} s old", implausible=True)
+        except (JointStateError, AttributeError) as error:
+            rejected = error if isinstance(error, JointStateError) else JointStateError("malformed", "it is none")
             self._counters[f"states rejected: {rejected.kind}"] += 1
             reasons.append(str(rejected))
             if rejected.implausible:

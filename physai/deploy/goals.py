@@ -23,7 +23,7 @@ class Goal:
     frame: str
 
 
-class GoalRejected(Exception):  # noqa: N818
+class GoalError(Exception):
     """A goal that cannot be taken: ``kind`` for counting, and a line for people."""
 
     def __init__(self, kind: str, message: str) -> None:
@@ -35,22 +35,22 @@ def accept(goal: Goal, metadata: Metadata, project: bool) -> np.ndarray:
     """Return the goal's position [2], m, moved onto the ring of reachable goals if that is allowed.
 
     Raises:
-        GoalRejected: If it is not two finite numbers in the right frame, or out of reach.
+        GoalError: If it is not two finite numbers in the right frame, or out of reach.
     """
     position = to_floats(goal.position) if isinstance(goal, Goal) else None
     if position is None:
-        raise GoalRejected("malformed", "goal rejected: it is not two numbers")
+        raise GoalError("malformed", "goal rejected: it is not two numbers")
     if position.shape != (2,):
-        raise GoalRejected("malformed", f"goal rejected: it has the shape {list(position.shape)}, not [2]")
+        raise GoalError("malformed", f"goal rejected: it has the shape {list(position.shape)}, not [2]")
     radius = math.hypot(*position)
     if not math.isfinite(radius):
-        raise GoalRejected("not finite", "goal rejected: it is not finite")
+        raise GoalError("not finite", "goal rejected: it is not finite")
     if goal.frame != metadata.goal_frame:
-        raise GoalRejected("wrong frame", f"goal rejected: frame '{goal.frame}' is not '{metadata.goal_frame}'")
+        raise GoalError("wrong frame", f"goal rejected: frame '{goal.frame}' is not '{metadata.goal_frame}'")
     inner, outer = metadata.goal_radius
     # A goal on the very edge, written with fewer digits, is meant to be in.
     if inner - 1e-6 <= radius <= outer + 1e-6:
         return position
     if project and radius > 1e-6:
         return position * (min(max(radius, inner), outer) / radius)
-    raise GoalRejected("unreachable", f"goal rejected: {radius:.3f} m from the base, not {inner:g} to {outer:g} m")
+    raise GoalError("unreachable", f"goal rejected: {radius:.3f} m from the base, not {inner:g} to {outer:g} m")

@@ -32,7 +32,7 @@ class JointState:
     received: float | None = None
 
 
-class StateRejected(Exception):  # noqa: N818
+class JointStateError(Exception):
     """A joint state that cannot be used: ``kind`` for counting, a line for people.
 
     Attributes:
@@ -66,12 +66,12 @@ class JointReader:
         """Return positions [n] rad and velocities [n] rad/s of a state that was received at a time, s.
 
         Raises:
-            StateRejected: If it cannot be used, and why.
+            JointStateError: If it cannot be used, and why.
         """
         try:
             return self._read(state, received)
         except (TypeError, ValueError, OverflowError) as error:  # names, stamps or lists that are none
-            raise StateRejected("malformed", f"it is malformed ({str(error)[:60]})") from None
+            raise JointStateError("malformed", f"it is malformed ({str(error)[:60]})") from None
 
     def _read(self, state: JointState, received: float) -> tuple[np.ndarray, np.ndarray]:
         names = tuple(state.names)
@@ -82,7 +82,7 @@ class JointReader:
         velocity = _numbers(state.velocity, len(names), "velocity") if len(state.velocity) else None
         stamp = to_float(state.stamp)
         if not math.isfinite(stamp):
-            raise StateRejected("stamp not finite", "its stamp is not finite")
+            raise JointStateError("stamp not finite", "its stamp is not finite")
         before, self._before = self._before, (position, stamp, received)
         elapsed = 0.0
         if before is not None:
@@ -93,48 +93,48 @@ class JointReader:
         unknown = ~np.isfinite(velocity)
         if unknown.any():
             if not self._estimate:
-                raise StateRejected("velocity missing", "a velocity is missing or not finite")
+                raise JointStateError("velocity missing", "a velocity is missing or not finite")
             if before is None or elapsed > self._timeout:
-                raise StateRejected("velocity missing", "a velocity is missing, with no recent position to estimate it")
+                raise JointStateError("velocity missing", "a velocity is missing, and so is a recent position")
             estimate = np.clip((position - before[0]) / elapsed, -self._speed, self._speed)
             velocity = np.where(unknown, estimate, velocity)
         if (np.abs(velocity) > self._speed).any():
-            raise StateRejected("velocity implausible", f"velocities {velocity.tolist()} rad/s cannot be true", True)
+            raise JointStateError("velocity implausible", f"velocities {velocity.tolist()} rad/s cannot be true", True)
         return position, velocity
 
     def _map(self, names: tuple[str, ...]) -> list[int]:
         if len(set(names)) != len(names):
-            raise StateRejected("duplicate name", "a joint is named twice")
+            raise JointStateError("duplicate name", "a joint is named twice")
         for joint in self._joints:
             if joint not in names:
-                raise StateRejected("joint missing", f"joint '{joint}' is missing")
+                raise JointStateError("joint missing", f"joint '{joint}' is missing")
         return [names.index(joint) for joint in self._joints]
 
     def _check_motion(self, moved: np.ndarray, elapsed: float) -> None:
         if elapsed == 0:
-            raise StateRejected("stamp repeated", "its stamp is that of the state before", True)
+            raise JointStateError("stamp repeated", "its stamp is that of the state before", True)
         if elapsed < 0:
-            raise StateRejected("stamp backwards", f"its stamp runs {-elapsed:.3f} s backwards", True)
+            raise JointStateError("stamp backwards", f"its stamp runs {-elapsed:.3f} s backwards", True)
         far = np.abs(moved) > self._speed * elapsed + _ENCODER_NOISE
         if far.any():
             joint = int(far.argmax())
             text = f"'{self._joints[joint]}' jumped by {moved[joint]:.3f} rad in {elapsed:.3f} s"
-            raise StateRejected("position jump", text, True)
+            raise JointStateError("position jump", text, True)
 
 
 def to_float(value: float) -> float:
     """Return a time as a float.
 
     Raises:
-        StateRejected: If it is no number.
+        JointStateError: If it is no number.
     """
-    array = to_floats(value)  # type: ignore[arg-type]
+    array = to_floats(value)
     if array is None or array.shape:
-        raise StateRejected("malformed", "its stamp, or the time of its receipt, is no number")
+        raise JointStateError("malformed", "its stamp, or the time of its receipt, is no number")
     return float(array)
 
 
-def to_floats(values: Sequence[float]) -> np.ndarray | None:
+def to_floats(values: Sequence[float] | float) -> np.ndarray | None:
     """Return numbers as float64; None if they are no numbers (text is none, whatever it says)."""
     try:
         array = np.asarray(values)
@@ -146,12 +146,12 @@ def to_floats(values: Sequence[float]) -> np.ndarray | None:
 def _numbers(values: Sequence[float], count: int, what: str) -> np.ndarray:
     array = to_floats(values)
     if array is None:
-        raise StateRejected("malformed", f"its {what} is not a list of numbers")
+        raise JointStateError("malformed", f"its {what} is not a list of numbers")
     if array.shape != (count,):
-        raise StateRejected("lengths disagree", f"{count} names, but {what} has the shape {list(array.shape)}")
+        raise JointStateError("lengths disagree", f"{count} names, but {what} has the shape {list(array.shape)}")
     return array
 
 
 def _finite(array: np.ndarray, what: str) -> None:
     if not np.isfinite(array).all():
-        raise StateRejected(f"{what} not finite", f"a {what} is not finite")
+        raise JointStateError(f"{what} not finite", f"a {what} is not finite")

@@ -152,7 +152,7 @@ def load_module(content: bytes) -> torch.jit.ScriptModule:
         RuntimeError: If torch cannot read it.
     """
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DeprecationWarning)  # of TorchScript, which this file is alone to use
+        warnings.simplefilter("ignore", DeprecationWarning)  # of TorchScript
         module = torch.jit.load(io.BytesIO(content), map_location="cpu").eval()
         for method, arguments in (("forward", INPUTS), ("distance", ("joint_position", "goal"))):
             found = [a.name for a in getattr(module, method).schema.arguments[1:]] if hasattr(module, method) else None

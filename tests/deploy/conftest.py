@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -77,3 +78,13 @@ class Troubled:
         self.failed = True
         self.seconds += self.trouble == "slow"
         return FAILURES[self.trouble](command)
+
+
+@pytest.fixture(scope="session")
+def content(exported_run) -> bytes:
+    return (exported_run / "policy.pt").read_bytes()
+
+
+@pytest.fixture
+def path(tmp_path) -> Path:
+    return tmp_path / "policy.pt"

@@ -1,10 +1,6 @@
-"""Files that are no policy, damaged or hostile ones: refused in one line, before anything in them is unpickled or run.
-
-Other tests of policy files use the helpers at the top.
-"""
+"""Files that are no policy, damaged or hostile: refused in one line, before anything in them is unpickled or run."""
 
 import io
-import json
 import os
 import pickle
 import random
@@ -25,57 +21,10 @@ from torch import Tensor, nn
 
 from physai.artifact.module import save
 from physai.deploy import Policy, PolicyError, load_policy, read_metadata
-from physai.deploy.archive import MAX_BYTES, content_sha256
-from physai.deploy.metadata import metadata_sha256
+from physai.deploy.archive import MAX_BYTES
+from tests.deploy.files import METADATA, commands, pack, records, refusal, sign
 
-METADATA = "archive/extra/metadata.json"
 COMPRESSED = 0x08
-GOLDEN = ("joint_position", "joint_velocity", "goal")
-
-
-@pytest.fixture(scope="module")
-def content(exported_run) -> bytes:
-    return (exported_run / "policy.pt").read_bytes()
-
-
-@pytest.fixture
-def path(tmp_path) -> Path:
-    return tmp_path / "policy.pt"
-
-
-def refusal(path: Path, **kwargs) -> str:
-    """What load_policy says of a file that it refuses: always one printable line that begins with the path."""
-    with pytest.raises(PolicyError) as error:
-        load_policy(path, **kwargs)
-    message = str(error.value)
-    assert message.startswith(f"{path}: ")
-    assert message.isprintable()  # no line break, nothing that moves a terminal's cursor
-    assert len(message) < 1500
-    return message.removeprefix(f"{path}: ")
-
-
-def records(content: bytes) -> dict[str, bytes]:
-    with zipfile.ZipFile(io.BytesIO(content)) as archive:
-        return {name: archive.read(name) for name in archive.namelist()}
-
-
-def pack(records: dict[str, bytes], compression: int = zipfile.ZIP_STORED) -> bytes:
-    target = io.BytesIO()
-    with zipfile.ZipFile(target, "w", compression) as archive:
-        for name, data in records.items():
-            archive.writestr(name, data)
-    return target.getvalue()
-
-
-def sign(records: dict[str, bytes]) -> dict[str, bytes]:
-    """What a forger would do: describe the records as they are now."""
-    metadata = json.loads(records[METADATA]) | {"content_sha256": content_sha256(pack(records))}
-    metadata["metadata_sha256"] = metadata_sha256(metadata)
-    return records | {METADATA: json.dumps(metadata).encode()}
-
-
-def commands(policy: Policy, golden: dict[str, np.ndarray]) -> np.ndarray:
-    return np.array([policy(*inputs) for inputs in zip(*(golden[key] for key in GOLDEN), strict=True)])
 
 
 def refused_or_unchanged(path: Path, original: Policy) -> bool:

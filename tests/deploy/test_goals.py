@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from physai.deploy import Goal
-from physai.deploy.goals import GoalRejected, accept
+from physai.deploy.goals import GoalError, accept
 
 
 @pytest.fixture(scope="module")
@@ -15,7 +15,7 @@ def metadata(policy):
 
 
 def rejection(goal, metadata, project=False):
-    with pytest.raises(GoalRejected) as caught:
+    with pytest.raises(GoalError) as caught:
         accept(goal, metadata, project)
     assert str(caught.value).startswith("goal rejected: ")
     assert "\n" not in str(caught.value)
@@ -77,6 +77,6 @@ def test_what_is_taken_lies_on_the_ring(metadata, position):
     for project in (True, False):
         try:
             taken = accept(Goal(position, "base"), metadata, project)
-        except GoalRejected:
+        except GoalError:
             continue
         assert 0.3 - 1.1e-6 <= math.hypot(*taken) <= 0.53 + 1.1e-6

@@ -6,7 +6,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from physai.deploy import ControllerConfig, JointState
-from physai.deploy.joints import JointReader, StateRejected
+from physai.deploy.joints import JointReader, JointStateError
 
 NAMES = ("joint1", "joint2")
 
@@ -37,7 +37,7 @@ def read(reader, *arguments, received=None, **values):
 
 
 def rejection(reader, *arguments, implausible=False, **values):
-    with pytest.raises(StateRejected) as caught:
+    with pytest.raises(JointStateError) as caught:
         read(reader, *arguments, **values)
     assert str(caught.value).startswith("joint state rejected: ")
     assert caught.value.implausible is implausible
@@ -236,7 +236,7 @@ def test_whatever_comes_is_rejected_or_read_as_finite_plausible_numbers(metadata
     for message in messages:
         try:
             position, velocity = joint_reader.read(message, message.stamp)
-        except StateRejected:
+        except JointStateError:
             continue
         assert position.shape == velocity.shape == (2,)
         assert np.isfinite(position).all()

@@ -5,7 +5,6 @@ import io
 import json
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,18 +16,7 @@ from physai.artifact.module import save
 from physai.deploy import PolicyError, load_policy, read_metadata
 from physai.deploy.archive import content_sha256
 from physai.deploy.metadata import metadata_sha256
-from tests.deploy.test_archive import METADATA, commands, pack, records, refusal, sign
-
-
-@pytest.fixture(scope="module")
-def content(exported_run) -> bytes:
-    return (exported_run / "policy.pt").read_bytes()
-
-
-@pytest.fixture
-def path(tmp_path) -> Path:
-    return tmp_path / "policy.pt"
-
+from tests.deploy.files import METADATA, commands, pack, records, refusal, sign
 
 # --- the policy that was exported
 
