@@ -4,7 +4,7 @@ import enum
 import math
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -26,7 +26,7 @@ _MOVED = 0.1  # tolerances; a goal that moves by less is still the same
 class State(enum.Enum):
     """What the controller does, and how it ends."""
 
-    WAITING = "waiting"  # for a joint state or a goal
+    WAITING = "waiting"  # for a joint state, a goal, or permission to move
     ACTIVE = "active"  # the policy drives
     REACHED = "reached"  # zero velocity at the goal, until it moves or the arm drifts
     HOLD = "hold"  # zero velocity, until enough good joint states have come in a row
@@ -71,15 +71,13 @@ class Controller:
         config: ControllerConfig | None = None,
         stopwatch: Callable[[], float] = time.perf_counter,
     ) -> None:
-        self.config = config = config or ControllerConfig()
         self.policy = policy
-        metadata = policy.metadata
-        self._period = 1.0 / metadata.control_rate
-        _check(config, metadata, self._period)
+        self._period = 1.0 / policy.metadata.control_rate
         self._stopwatch = stopwatch
-        self._reader = JointReader(metadata, config)
-        self._limits = VelocityLimits(metadata, config)
-        self._zeros = np.zeros(len(metadata.joints))
+        config = config or ControllerConfig()
+        self._reader = JointReader(policy.metadata, config)
+        self.configure(config)
+        self._zeros = np.zeros(len(policy.metadata.joints))
         self._now: float | None = None
         self._still = 0  # updates in a row at that time
         self._position: np.ndarray | None = None
@@ -97,13 +95,32 @@ class Controller:
         self._since = 0.0
         self._counters: Counter[str] = Counter()
 
-    def update(self, now: float, joint_state: JointState | None = None, goal: Goal | None = None) -> Command:
+    def configure(self, config: ControllerConfig) -> None:
+        """Take other limits and timeouts; they hold from the next update on.
+
+        Raises:
+            UserError: If the limits do not fit the robot; those of before stay.
+        """
+        _check(config, self.policy.metadata, self._period)
+        self.config = config
+        self._reader.configure(config)
+        self._limits = VelocityLimits(self.policy.metadata, config)
+
+    def update(
+        self,
+        now: float,
+        joint_state: JointState | None = None,
+        goal: Goal | None = None,
+        interlocks: Sequence[str] = (),
+    ) -> Command:
         """Take what is new, and return what to send.
 
         Args:
             now: The time, s, by a clock that does not jump.
             joint_state: A joint state that has come in since the last update.
             goal: A goal that has come in since then; the last good one stays until another comes.
+            interlocks: Why the arm must not move now though nothing is wrong with it, such as "not enabled"; it waits
+                until there is none.
 
         Returns:
             Velocities [n] in rad/s, or none before the first joint state; with state and reasons.
@@ -117,7 +134,7 @@ class Controller:
             self._take_state(now, joint_state, not stop, reasons)
         if self._position is not None and now - self._received > self.config.state_timeout:
             reasons.append(self._hold("state old", f"the last joint state is {now - self._received:.3f} s old"))
-        state = self._state(reasons)
+        state = self._state(interlocks, reasons)
         velocity = self._zeros
         if state is State.ACTIVE:
             if not stop:
@@ -146,9 +163,13 @@ class Controller:
         """
         if self._latched is not None:
             self._latched = None
-            self._goal, self._reached = None, False
+            self.forget_goal()
             self._failures = 0
             self._needed = self.config.recovery_states
+
+    def forget_goal(self) -> None:
+        """Wait for a new goal."""
+        self._goal, self._reached = None, False
 
     def snapshot(self) -> dict[str, Any]:
         """State, its reasons and counters, for diagnostics; plain values only."""
@@ -241,7 +262,7 @@ class Controller:
         self._counters[f"faults: {kind}"] += 1
         self._latched, self._latch_reason = State.FAULT, reason
 
-    def _state(self, reasons: list[str]) -> State:
+    def _state(self, interlocks: Sequence[str], reasons: list[str]) -> State:
         if self._latched is not None:
             reasons.append(self._latch_reason)
             return self._latched
@@ -251,10 +272,10 @@ class Controller:
         if self._needed:
             reasons.append(f"{self._needed} more good joint states are needed")
             return State.HOLD
+        reasons += interlocks
         if self._goal is None:
             reasons.append("no goal yet")
-            return State.WAITING
-        return State.ACTIVE
+        return State.WAITING if interlocks or self._goal is None else State.ACTIVE
 
     def _drive(self, elapsed: float, reasons: list[str]) -> np.ndarray:
         """Ask the policy, and limit what it wants."""

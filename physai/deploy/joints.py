@@ -49,18 +49,24 @@ class JointReader:
     """Turns joint states into positions and velocities in the policy's order, and remembers the last well-formed one.
 
     Args:
-        metadata: Names and velocity limits of the joints.
+        metadata: Names and limits of the joints.
         config: ``jump_factor``, ``allow_velocity_estimate`` and ``state_timeout`` are used.
     """
 
     def __init__(self, metadata: Metadata, config: ControllerConfig) -> None:
         self._joints = metadata.joints
-        self._speed = metadata.velocity_limit * config.jump_factor
-        self._estimate = config.allow_velocity_estimate
-        self._timeout = config.state_timeout
+        self._velocity_limit = metadata.velocity_limit
+        self._continuous = np.isinf(metadata.position_limit[:, 0])
+        self.configure(config)
         self._names: tuple[str, ...] = ()
         self._index: list[int] = []
         self._before: tuple[np.ndarray, float, float] | None = None  # position, stamp, received
+
+    def configure(self, config: ControllerConfig) -> None:
+        """Take other values of these."""
+        self._speed = self._velocity_limit * config.jump_factor
+        self._estimate = config.allow_velocity_estimate
+        self._timeout = config.state_timeout
 
     def read(self, state: JointState, received: float) -> tuple[np.ndarray, np.ndarray]:
         """Return positions [n] rad and velocities [n] rad/s of a state that was received at a time, s.
@@ -84,11 +90,14 @@ class JointReader:
         if not math.isfinite(stamp):
             raise JointStateError("stamp not finite", "its stamp is not finite")
         before, self._before = self._before, (position, stamp, received)
-        elapsed = 0.0
+        elapsed, moved = 0.0, np.zeros(len(position))
         if before is not None:
             elapsed = stamp - before[1]
+            # Some drivers count a continuous joint from -π to π: the shorter way around is what it has moved.
+            moved = position - before[0]
+            moved -= self._continuous * (2 * math.pi) * np.round(moved / (2 * math.pi))
             # A source whose stamps run ahead must not make room for jumps.
-            self._check_motion(position - before[0], min(elapsed, max(0.0, received - before[2]) + self._timeout))
+            self._check_motion(moved, min(elapsed, max(0.0, received - before[2]) + self._timeout))
         velocity = np.full(len(position), np.nan) if velocity is None else velocity[self._index]
         unknown = ~np.isfinite(velocity)
         if unknown.any():
@@ -96,7 +105,7 @@ class JointReader:
                 raise JointStateError("velocity missing", "a velocity is missing or not finite")
             if before is None or elapsed > self._timeout:
                 raise JointStateError("velocity missing", "a velocity is missing, and so is a recent position")
-            estimate = np.clip((position - before[0]) / elapsed, -self._speed, self._speed)
+            estimate = np.clip(moved / elapsed, -self._speed, self._speed)
             velocity = np.where(unknown, estimate, velocity)
         if (np.abs(velocity) > self._speed).any():
             raise JointStateError("velocity implausible", f"velocities {velocity.tolist()} rad/s cannot be true", True)

@@ -56,7 +56,7 @@ class Simulation:
                 f"env.max_velocity: {config.max_velocity} rad/s is beyond the limit of '{self.spec.name}', "
                 f"{self.spec.velocity_limit.min():g} rad/s"
             )
-        self.observation = self.task.observation(self.kinematics)
+        self.observation = self.task.observation(self.spec, self.kinematics)
         self.physics: Physics = PyBulletPhysics(self.spec, num_envs, config.control_dt, config.substeps)
         self.generator = torch.Generator()
         self.seed(seed)

@@ -58,6 +58,11 @@ class RobotSpec:
     moving_links: tuple[str, ...]
     link_mass: np.ndarray
 
+    @property
+    def continuous(self) -> np.ndarray:
+        """Which joints turn without end, [n]."""
+        return np.isinf(self.position_limit[:, 0])
+
     @classmethod
     def from_config(cls, config: RobotConfig) -> "RobotSpec":
         """Read the URDF and check that it has what the config names.

@@ -18,14 +18,16 @@ class ReachObservation(nn.Module):
     The observation is ``[q, qd, ee_x, ee_y, goal_x, goal_y]``. Features say the same in terms that a small network
     learns from quickly: sine and cosine of the joints, the error e = goal - ee, and Jᵀe, the direction in joint space
     that shortens it fastest (Khatib, 1987); both errors appear once in units of the arm and once, saturated, in units
-    of the tolerance.
+    of the tolerance. Positions of continuous joints are those within half a turn: an arm that has turned around many
+    times looks like one that has not.
 
     Args:
-        kinematics: The robot's forward kinematics.
+        spec: The robot.
+        kinematics: Its forward kinematics.
         tolerance: Distance that counts as reached, m.
     """
 
-    def __init__(self, kinematics: ForwardKinematics, tolerance: float) -> None:
+    def __init__(self, spec: RobotSpec, kinematics: ForwardKinematics, tolerance: float) -> None:
         super().__init__()
         self.kinematics = kinematics
         length, joints = kinematics.reach, kinematics.constant.shape[0]
@@ -34,6 +36,9 @@ class ReachObservation(nn.Module):
         # Scales of [e, Jᵀe]: buffers, for TorchScript turns a number into a tensor again at every call.
         self.register_buffer("coarse", torch.tensor([2.0 / length] * 2 + [0.25 / (length * tolerance)] * joints))
         self.register_buffer("fine", torch.tensor([0.5 / tolerance] * 2 + [1.0 / (length * tolerance)] * joints))
+        self.continuous: Tensor
+        self.register_buffer("continuous", torch.from_numpy(spec.continuous))
+        self.wraps = bool(spec.continuous.any())
 
     def forward(self, joint_position: Tensor, joint_velocity: Tensor, goal: Tensor) -> tuple[Tensor, Tensor]:
         """Map positions [N, n] rad, velocities [N, n] rad/s and goals [N, 2] m to observation and features.
@@ -46,11 +51,14 @@ class ReachObservation(nn.Module):
         end_effector = position.squeeze(2)
         error = goal - end_effector
         errors = torch.cat([error, torch.bmm(error.unsqueeze(1), jacobian).squeeze(1)], dim=1)
+        sine, cosine = torch.sin(joint_position), torch.cos(joint_position)
+        if self.wraps:
+            joint_position = torch.where(self.continuous, torch.atan2(sine, cosine), joint_position)
         observation = torch.cat([joint_position, joint_velocity, end_effector, goal], dim=1)
         features = torch.cat(
             [
-                torch.sin(joint_position),
-                torch.cos(joint_position),
+                sine,
+                cosine,
                 errors * self.coarse,
                 torch.tanh(errors * self.fine),
             ],
@@ -124,14 +132,16 @@ class Reach:
         lower, upper = torch.from_numpy(spec.position_limit).T
         return torch.clamp(start, lower, upper)
 
-    def observation(self, kinematics: ForwardKinematics) -> ReachObservation:
+    def observation(self, spec: RobotSpec, kinematics: ForwardKinematics) -> ReachObservation:
         """Return the module that makes observation and features for a robot."""
-        return ReachObservation(kinematics, self.tolerance)
+        return ReachObservation(spec, kinematics, self.tolerance)
 
     def observation_bounds(self, spec: RobotSpec, kinematics: ForwardKinematics) -> tuple[Tensor, Tensor]:
         """Lower and upper bound of an observation, [2n + 4] each; with room, for joint limits are not walls."""
         velocity = 2.0 * torch.from_numpy(spec.velocity_limit)
-        lower, upper = torch.from_numpy(spec.position_limit).T
+        limits = torch.from_numpy(spec.position_limit).clone()
+        limits[spec.continuous] = torch.tensor([-math.pi, math.pi], dtype=limits.dtype)
+        lower, upper = limits.T
         end_effector = torch.full((2,), kinematics.reach * 1.01)
         goal = torch.full((2,), self.goal_radius[1])
         return (
