@@ -22,7 +22,7 @@ $(VENV)/.installed: pyproject.toml constraints.txt | $(BIN)/python
 
 $(VENV)/.installed-dev: $(VENV)/.installed
 	@echo "==> Installing the tools for tests and benchmarks into $(VENV)"
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev,bench,onnx]'
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev,bench,onnx,ros]'
 	@touch $@
 
 train: $(VENV)/.installed  ## Train the two-link arm (ARGS="env=kuka_reacher seed=1" for more)

@@ -22,8 +22,8 @@ class PolicyChoice(Config):
 
     def load(self) -> "TrainedPolicy":
         """Read it; raises a UserError if something is missing or damaged."""
+        from physai.physics import RandomizationConfig
         from physai.training.run import TrainedPolicy
-        from physai.transforms import RandomizationConfig
 
         chosen = None
         if self.randomization is not None:

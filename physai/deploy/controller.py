@@ -74,10 +74,10 @@ class Controller:
         self.policy = policy
         self._period = 1.0 / policy.metadata.control_rate
         self._stopwatch = stopwatch
+        self._zeros = self._last = np.zeros(len(policy.metadata.joints))
         config = config or ControllerConfig()
         self._reader = JointReader(policy.metadata, config)
         self.configure(config)
-        self._zeros = np.zeros(len(policy.metadata.joints))
         self._now: float | None = None
         self._still = 0  # updates in a row at that time
         self._position: np.ndarray | None = None
@@ -90,7 +90,6 @@ class Controller:
         self._failures = 0  # of the policy, in a row
         self._latched: State | None = None
         self._latch_reason = ""
-        self._last = self._zeros
         self._command = Command(None, State.WAITING, ())
         self._since = 0.0
         self._counters: Counter[str] = Counter()
@@ -105,6 +104,8 @@ class Controller:
         self.config = config
         self._reader.configure(config)
         self._limits = VelocityLimits(self.policy.metadata, config)
+        # A lower velocity holds at once, whatever the acceleration limit: the margin may be too narrow for a higher one.
+        self._last = self._last * min(1.0, config.max_velocity / max(np.abs(self._last).max(), 1e-9))
 
     def update(
         self,

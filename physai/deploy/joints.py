@@ -56,7 +56,7 @@ class JointReader:
     def __init__(self, metadata: Metadata, config: ControllerConfig) -> None:
         self._joints = metadata.joints
         self._velocity_limit = metadata.velocity_limit
-        self._continuous = np.isinf(metadata.position_limit[:, 0])
+        self._continuous = np.isinf(metadata.position_limit).all(axis=1)
         self.configure(config)
         self._names: tuple[str, ...] = ()
         self._index: list[int] = []
@@ -95,7 +95,8 @@ class JointReader:
             elapsed = stamp - before[1]
             # Some drivers count a continuous joint from -π to π: the shorter way around is what it has moved.
             moved = position - before[0]
-            moved -= self._continuous * (2 * math.pi) * np.round(moved / (2 * math.pi))
+            around = moved - 2 * math.pi * np.round(moved / (2 * math.pi))
+            moved = np.where(self._continuous, around, moved)
             # A source whose stamps run ahead must not make room for jumps.
             self._check_motion(moved, min(elapsed, max(0.0, received - before[2]) + self._timeout))
         velocity = np.full(len(position), np.nan) if velocity is None else velocity[self._index]
@@ -124,7 +125,7 @@ class JointReader:
             raise JointStateError("stamp repeated", "its stamp is that of the state before", True)
         if elapsed < 0:
             raise JointStateError("stamp backwards", f"its stamp runs {-elapsed:.3f} s backwards", True)
-        far = np.abs(moved) > self._speed * elapsed + _ENCODER_NOISE
+        far = ~(np.abs(moved) <= self._speed * elapsed + _ENCODER_NOISE)  # also where it is NaN: of numbers too large
         if far.any():
             joint = int(far.argmax())
             text = f"'{self._joints[joint]}' jumped by {moved[joint]:.3f} rad in {elapsed:.3f} s"

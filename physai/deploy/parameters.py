@@ -53,7 +53,8 @@ class Parameters:
         kind = type(field.default)
         if kind is tuple and isinstance(value, list | tuple):
             wanted = float if "float" in str(field.type) else str
-            object.__setattr__(self, field.name, value := tuple(_to_float(item) for item in value))
+            value = tuple(map(_to_float, value) if wanted is float else value)
+            object.__setattr__(self, field.name, value)
             if not all(type(item) is wanted for item in value):
                 return f"{field.name}: a list of {wanted.__name__} is needed, got {list(value)!r}"
             if wanted is str:
@@ -63,7 +64,7 @@ class Parameters:
         if type(value) is not kind:
             return f"{field.name}: a {kind.__name__} is needed, got {value!r}"
         low, high, unit, choices = (field.metadata[key] for key in ("low", "high", "unit", "choices"))
-        if kind in (int, float, tuple) and not all(low <= number <= high for number in np.atleast_1d(value)):
+        if kind in (int, float, tuple) and not all(low <= number <= high for number in np.atleast_1d(value)):  # type: ignore[arg-type]
             return f"{field.name}: must lie between {low:g} and {high:g} {unit}".rstrip() + f", got {value}"
         if choices and value not in choices:
             return f"{field.name}: must be {' or '.join(map(repr, choices))}, got {value!r}"
@@ -71,7 +72,7 @@ class Parameters:
 
 
 def _to_float(value: Any) -> Any:
-    if isinstance(value, int) and not isinstance(value, bool):
+    if isinstance(value, int | float) and not isinstance(value, bool):
         with contextlib.suppress(OverflowError):
             return float(value)
     return value

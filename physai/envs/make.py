@@ -11,13 +11,13 @@ from torchrl.envs.transforms import Compose, Transform
 from physai.config import Config, PositiveFloat, compose, validate
 from physai.envs.robot_env import RobotEnv
 from physai.envs.simulation import EnvConfig, Simulation
+from physai.physics import RandomizationConfig
 from physai.seeding import derive
 from physai.transforms import (
     ActuatorDelay,
     DomainRandomization,
     Observation,
     ObservationNormalization,
-    RandomizationConfig,
     SensorModel,
 )
 from physai.transforms.stochastic import StochasticTransform

@@ -15,10 +15,10 @@ from physai.algorithms import OnPolicy
 from physai.collectors import RobotCollector, make_collector
 from physai.envs.make import TransformedRobotEnv, make_env
 from physai.errors import UserError
+from physai.physics import RandomizationConfig
 from physai.policies import input_size
 from physai.seeding import derive
 from physai.training.config import TrainConfig
-from physai.transforms import RandomizationConfig
 
 logging.getLogger("torchrl").setLevel(logging.WARNING)  # at INFO it reports every storage that it allocates
 

@@ -6,7 +6,7 @@ from physai.collectors import CollectorConfig
 from physai.config import Config, Count, Seed, Target
 from physai.envs.make import NormalizationConfig
 from physai.envs.simulation import EnvConfig
-from physai.transforms import RandomizationConfig
+from physai.physics import RandomizationConfig
 
 
 class CheckpointConfig(Config):

@@ -13,6 +13,7 @@ from tensordict.nn import TensorDictModuleBase
 from physai.config import validate
 from physai.envs.make import TransformedRobotEnv
 from physai.errors import UserError
+from physai.physics import RandomizationConfig
 from physai.plotting import plot_runs
 from physai.seeding import derive
 from physai.training import checkpoint
@@ -20,7 +21,6 @@ from physai.training.agent import Agent, load_policy_state, make_actor, make_eva
 from physai.training.config import TrainConfig
 from physai.training.evaluation import MAX_ROBOTS, Evaluation, evaluate
 from physai.training.loop import Clock, Interrupted, stop_signals, train
-from physai.transforms import RandomizationConfig
 
 FINAL_SEED = derive(0, "final evaluation goals")
 

@@ -3,7 +3,7 @@
 from physai.transforms.actuation import ActuatorDelay
 from physai.transforms.normalization import ObservationNormalization
 from physai.transforms.observation import Observation
-from physai.transforms.randomization import DomainRandomization, RandomizationConfig
+from physai.transforms.randomization import DomainRandomization
 from physai.transforms.sensing import SensorModel
 
 __all__ = [
@@ -11,6 +11,5 @@ __all__ = [
     "DomainRandomization",
     "Observation",
     "ObservationNormalization",
-    "RandomizationConfig",
     "SensorModel",
 ]

@@ -16,7 +16,7 @@ from physai.artifact import export as module
 from physai.artifact import export_policy, gate
 from physai.artifact.inspect import show
 from physai.artifact.onnx import describe
-from physai.deploy import load_policy
+from physai.deploy import load_policy, read_metadata
 from physai.deploy.metadata import metadata_sha256
 from physai.errors import UserError
 from tests.training.small import SMALL, command
@@ -47,7 +47,7 @@ def test_the_metadata_says_everything_a_robot_must_know(exported_run):
     assert raw["robot"]["name"] == "planar_arm"
     assert raw["robot"]["joints"] == ["joint1", "joint2"]
     assert raw["limits"] == {
-        "position": [[-6.2832, 6.2832], [-2.6, 2.6]],
+        "position": [[None, None], [-2.6, 2.6]],
         "velocity": [2.5, 2.5],
         "effort": [5.0, 3.0],
         "command": [2.0, 2.0],
@@ -87,6 +87,24 @@ def test_golden_pairs_are_full_precision_and_hold_in_both_forms(exported_run):
         assert np.array_equal(policy(*inputs.values()), golden["joint_velocity_command"][row])
         (command,) = session.run(None, {key: value[None] for key, value in inputs.items()})
         np.testing.assert_allclose(command[0], golden["joint_velocity_command"][row], rtol=0, atol=1e-5)
+
+
+def test_an_ideal_arm_reaches_twenty_goals_in_a_row_without_going_home(exported_run):
+    arms, metadata = 64, read_metadata(exported_run / "policy.pt")
+    lower, upper = torch.from_numpy(metadata.position_limit).float().T
+    policy, draw = torch.jit.load(exported_run / "policy.pt"), torch.Generator().manual_seed(0)
+    q = v = farthest = torch.zeros(arms, 2)
+    for _ in range(20):
+        radius, angle = torch.rand(2, arms, 1, generator=draw)
+        inner, outer = metadata.goal_radius
+        goal = (inner + (outer - inner) * radius) * torch.cat([torch.cos(6.2832 * angle), torch.sin(6.2832 * angle)], 1)
+        for _ in range(200):
+            away = policy.distance(q, goal) >= metadata.goal_tolerance
+            v = policy(q, v, goal) * away
+            q = torch.clamp(q + v / metadata.control_rate, lower, upper)
+            farthest = torch.maximum(farthest, q.abs())
+        assert not away.any()
+    assert farthest[:, 0].max() > 4 * torch.pi  # some have turned around more than twice
 
 
 def plant(monkeypatch, defect):

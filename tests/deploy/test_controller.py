@@ -9,6 +9,7 @@ import torch
 
 from physai.deploy import Controller, ControllerConfig, Goal, JointState, State
 from physai.envs.simulation import Simulation
+from physai.errors import UserError
 from tests.deploy.conftest import ALL_FAILURES, DISTANCES, Troubled
 
 PERIOD = 0.02
@@ -30,9 +31,9 @@ class Robot:
             **{"names": NAMES, "position": list(self.position), "velocity": [0.0, 0.0], "stamp": self.now} | changes
         )
 
-    def tick(self, after=PERIOD, state=DEFAULT, goal=None, **changes):
+    def tick(self, after=PERIOD, state=DEFAULT, goal=None, interlocks=(), **changes):
         self.now += after
-        return self.controller.update(self.now, self.state(**changes) if state is DEFAULT else state, goal)
+        return self.controller.update(self.now, self.state(**changes) if state is DEFAULT else state, goal, interlocks)
 
     def ticks(self, count, **arguments):
         return [self.tick(**arguments) for _ in range(count)]
@@ -278,6 +279,31 @@ def test_a_stamp_that_stands_still_or_runs_backwards_holds_as_long_as_it_does(mo
     for tick in range(50):
         assert is_stopped(moving.tick(stamp=stamp - (tick * 0.01 if kind == "stamp backwards" else 0.0)), State.HOLD)
     assert recovers(moving)
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_a_continuous_joint_that_is_counted_from_half_a_turn_to_half_a_turn_does_not_stop_there(robot, sign):
+    robot.policy.trouble = lambda command: np.array([sign * 2.0, 0.0])
+    angle = sign * 3.0
+    robot.position = [angle, 1.0]
+    command = robot.tick(goal=FAR_GOAL)
+    for _ in range(100):
+        angle += command.velocity[0] * PERIOD
+        robot.position = [math.remainder(angle, 2 * math.pi), 1.0]
+        command = robot.tick(velocity=command.velocity)
+        assert command.state is State.ACTIVE
+        assert command.reasons == ()
+    assert abs(angle) > 3.5
+
+
+@pytest.mark.parametrize("turns", [-100, -1, 1, 3])
+def test_after_any_number_of_turns_it_drives_as_after_none(policy, turns):
+    turned, unturned = Robot(policy), Robot(policy)
+    turned.position[0] += turns * 2 * math.pi
+    for robot in (turned, unturned):
+        robot.tick(goal=FAR_GOAL)
+    for _ in range(30):
+        np.testing.assert_allclose(turned.tick().velocity, unturned.tick().velocity, atol=1e-3)
 
 
 # Row: position beyond its limit.
@@ -702,6 +728,175 @@ def test_a_reset_without_need_changes_nothing(policy):
         each.drive()
     robot.controller.reset()
     assert robot.tick().velocity.tolist() == untouched.tick().velocity.tolist()
+
+
+# Interlocks.
+
+INTERLOCKS = ("not enabled", "a person is near")
+
+
+def test_an_interlock_stops_the_arm_at_once_without_a_fault_and_without_asking_the_policy(moving):
+    for interlocks in (INTERLOCKS, INTERLOCKS[:1], list(INTERLOCKS[1:])):
+        moving.policy.forget()
+        command = moving.tick(interlocks=interlocks)
+        assert is_stopped(command, State.WAITING)
+        assert command.reasons == tuple(interlocks)
+        assert moving.policy.measured is None
+        assert not moving.policy.called
+    assert {name for name in moving.counters if name.startswith("entered")} == {"entered active", "entered waiting"}
+
+
+def test_without_interlocks_it_goes_on_from_zero_to_the_goal_that_it_had(moving):
+    moving.ticks(10, interlocks=INTERLOCKS)
+    assert moving.controller.snapshot()["goal"] == FAR_GOAL.position
+    assert recovers(moving, stay_for=0)
+
+
+def test_an_interlock_and_a_missing_goal_are_both_named(robot):
+    assert robot.tick(interlocks=INTERLOCKS).reasons == (*INTERLOCKS, "no goal yet")
+    assert robot.tick(interlocks=INTERLOCKS, goal=FAR_GOAL).reasons == INTERLOCKS
+    assert robot.tick().velocity.any()
+
+
+def test_before_the_first_state_an_interlock_sends_nothing(robot):
+    command = robot.tick(state=None, goal=FAR_GOAL, interlocks=INTERLOCKS)
+    assert command.velocity is None
+    assert command.state is State.WAITING
+
+
+def test_what_goes_wrong_during_an_interlock_is_no_less_wrong(moving):
+    assert is_stopped(moving.ticks(6, state=None, interlocks=INTERLOCKS)[-1], State.HOLD)
+    assert is_stopped(moving.ticks(5, interlocks=INTERLOCKS)[-1], State.WAITING)
+    assert is_stopped(moving.tick(interlocks=INTERLOCKS, position=(0.5, 1.9)), State.HOLD)
+    moving.position = [0.5, 2.85]
+    assert is_stopped(moving.ticks(2, interlocks=INTERLOCKS)[-1], State.FAULT)
+    moving.controller.emergency_stop()
+    command = moving.tick(interlocks=INTERLOCKS)
+    assert is_stopped(command, State.ESTOP)
+    assert command.reasons == ("emergency stop",)
+
+
+def test_a_hold_ends_during_an_interlock(moving):
+    moving.ticks(6, state=None)
+    for state in (State.HOLD,) * 4 + (State.WAITING,) * 3:
+        assert is_stopped(moving.tick(interlocks=INTERLOCKS), state)
+    assert recovers(moving, stay_for=0)
+
+
+def test_a_reached_goal_is_still_reached_after_an_interlock(robot):
+    robot.tick(goal=Goal(robot.tip(), "base"))
+    goal = robot.controller.snapshot()["goal"]
+    while robot.policy.distance(robot.position, goal) < 0.06:  # between one and one and a half tolerances
+        robot.position[0] += 0.01
+        assert is_stopped(robot.tick(interlocks=INTERLOCKS), State.WAITING)
+    assert is_stopped(robot.tick(), State.REACHED)
+
+
+# A goal that is forgotten.
+
+
+def test_without_its_goal_it_waits_at_once_for_a_new_one(moving):
+    moving.controller.forget_goal()
+    for command in moving.ticks(3):
+        assert is_stopped(command, State.WAITING)
+        assert command.reasons == ("no goal yet",)
+    assert moving.controller.snapshot()["goal"] is None
+    assert np.abs(moving.tick(goal=FAR_GOAL).velocity).max() == pytest.approx(2.0 * PERIOD)
+
+
+def test_a_reached_goal_that_is_forgotten_and_said_again_is_not_yet_reached(robot):
+    goal = Goal(robot.tip(), "base")
+    robot.tick(goal=goal)
+    while robot.policy.distance(robot.position, goal.position) < 0.06:
+        robot.position[0] += 0.01
+        assert is_stopped(robot.tick(), State.REACHED)
+    robot.controller.forget_goal()
+    assert robot.tick(goal=goal).state is State.ACTIVE
+
+
+@pytest.mark.parametrize("state", [State.ESTOP, State.FAULT, State.HOLD])
+def test_to_forget_a_goal_ends_no_stop(moving, state):
+    if state is State.ESTOP:
+        moving.controller.emergency_stop()
+    elif state is State.FAULT:
+        moving.policy.trouble = "NaN"
+        moving.ticks(3)
+    else:
+        moving.ticks(6, state=None)
+    moving.controller.forget_goal()
+    for command in moving.ticks(3, goal=FAR_GOAL):
+        assert is_stopped(command, state)
+
+
+# Other limits while it runs.
+
+
+def configure(robot, **values):
+    robot.controller.configure(ControllerConfig(**values))
+
+
+def test_a_lower_velocity_holds_at_once_and_keeps_the_direction_and_a_higher_one_is_accelerated_to(moving):
+    before = moving.tick().velocity
+    configure(moving, max_velocity=0.1)
+    np.testing.assert_allclose(moving.tick().velocity, before / 3, atol=1e-3)
+    configure(moving, max_velocity=0.2, max_acceleration=1.0)
+    speeds = [np.abs(moving.tick().velocity).max() for _ in range(6)]
+    np.testing.assert_allclose(speeds, [0.12, 0.14, 0.16, 0.18, 0.2, 0.2], rtol=1e-6)
+    assert moving.controller.config.max_velocity == 0.2
+
+
+def test_another_state_timeout_holds_from_the_next_update_on(moving):
+    moving.ticks(3, state=None)
+    configure(moving, state_timeout=0.07)
+    assert is_stopped(moving.tick(state=None), State.HOLD)
+    configure(moving, recovery_states=2)
+    assert is_stopped(moving.tick(state=None), State.HOLD)
+    moving.ticks(5)
+    assert is_stopped(moving.ticks(6, state=None)[-1], State.HOLD)
+    assert recovers(moving, stay_for=1)
+
+
+def test_other_limits_on_joint_states_and_goals_hold_from_the_next_update_on(moving):
+    configure(moving, allow_velocity_estimate=True, unreachable_goal="project")
+    command = moving.tick(velocity=(), goal=Goal([0.0, 4.0], "base"))
+    assert command.state is State.ACTIVE
+    assert command.reasons == ("goal out of reach: [0.0, 0.53] is the nearest in reach",)
+    configure(moving, jump_factor=1.0)
+    assert is_stopped(moving.tick(velocity=(0.0, 2.6)), State.HOLD)
+
+
+def test_a_wider_margin_stops_outward_motion_at_once(robot):
+    robot.policy.trouble = lambda command: np.array([0.0, 2.0])
+    robot.position = [0.0, 2.4]
+    robot.tick(goal=FAR_GOAL)
+    assert robot.ticks(10)[-1].velocity[1] > 0.2
+    configure(robot, limit_margin=0.21)
+    assert is_stopped(robot.tick(), State.ACTIVE)
+
+
+def test_other_limits_change_nothing_else(policy):
+    robot, untouched = Robot(policy), Robot(policy)
+    for each in (robot, untouched):
+        each.drive()
+    configure(robot)
+    assert robot.tick().velocity.tolist() == untouched.tick().velocity.tolist()
+    for each in (robot, untouched):
+        each.ticks(6, state=None)
+    configure(robot)
+    assert robot.controller.snapshot() == untouched.controller.snapshot()
+    assert recovers(robot)
+
+
+def test_limits_that_do_not_fit_the_robot_are_refused_and_those_of_before_stay(moving, policy):
+    undisturbed = Robot(policy)
+    undisturbed.drive()
+    for values in ({"max_velocity": 2.6}, {"state_timeout": 5.0}, {"limit_margin": 0.01}, {"clock_jump": 0.05}):
+        with pytest.raises(UserError, match=r"^\w+: "):
+            configure(moving, max_acceleration=0.1, recovery_states=1, **values)
+    assert moving.controller.config == ControllerConfig()
+    for arguments in (*({},) * 3, *({"state": None},) * 6, *({},) * 6):
+        ours, theirs = moving.tick(**arguments), undisturbed.tick(**arguments)
+        assert (ours.velocity.tolist(), ours.state) == (theirs.velocity.tolist(), theirs.state)
 
 
 # Reached.

@@ -1,5 +1,6 @@
 """What holds whatever happens: random sequences of states, goals, faults and times against a model of the contract."""
 
+import dataclasses
 import math
 import random
 from collections import Counter
@@ -10,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from physai.deploy import Controller, ControllerConfig, Goal, JointState, State
+from physai.errors import UserError
 from tests.deploy.conftest import ALL_FAILURES, Troubled
 
 PERIOD = 0.02
@@ -43,18 +45,14 @@ class World:
     """
 
     def __init__(self, policy, config, position, log=None):
-        self.policy, self.config, self.log = Troubled(policy), config, log
+        self.policy, self.log = Troubled(policy), log
         self.controller = Controller(self.policy, config, self.policy.stopwatch)
         self.policy.stop = self.controller.emergency_stop
-        metadata = policy.metadata
-        self.moved = 0.1 * metadata.goal_tolerance
-        self.lower, self.upper = metadata.position_limit.T.tolist()
-        self.plausible = [speed * config.jump_factor for speed in metadata.velocity_limit.tolist()]
-        self.acceleration = config.max_acceleration
-        self.fastest = config.max_velocity * (1 + 1e-12)
-        self.slow = min(config.limit_velocity, config.max_velocity)
+        self._take_config(config)
+        self.moved = 0.1 * policy.metadata.goal_tolerance
+        self.lower, self.upper = policy.metadata.position_limit.T.tolist()
         # The arm, and two clocks: that of the controller, and that of the stamps.
-        self.position, self.velocity = list(position), STILL
+        self.position, self.velocity, self.last = list(position), STILL, STILL
         self.now, self.stamp, self.started = 1000.0, 50.0, False
         # The model.
         self.before = self.accepted = self.goal = self.latched = None
@@ -78,28 +76,47 @@ class World:
         )
 
     def emergency_stop(self):
-        self.controller.emergency_stop()
+        self._tell("emergency_stop")
         self.latched = State.ESTOP
-        if self.log is not None:
-            self.log.append(("emergency_stop",))
 
     def reset(self):
-        self.controller.reset()
+        self._tell("reset")
         if self.latched:
             self.latched, self.failures, self.needed = None, 0, self.config.recovery_states
             self.goal, self.reached = None, False
-        if self.log is not None:
-            self.log.append(("reset",))
 
-    def tick(self, step=PERIOD, state=None, goal=None, verdict=None):
+    def forget_goal(self):
+        self._tell("forget_goal")
+        self.goal, self.reached = None, False
+
+    def configure(self, config):
+        self._tell("configure", config)
+        self._take_config(config)
+        share = min(1.0, config.max_velocity / max(*map(abs, self.last), 1e-9))
+        self.last = [velocity * share for velocity in self.last]
+
+    def _take_config(self, config):
+        self.config = config
+        self.plausible = [speed * config.jump_factor for speed in self.policy.metadata.velocity_limit.tolist()]
+        self.acceleration = config.max_acceleration
+        self.fastest = config.max_velocity * (1 + 1e-12)
+        self.slow = min(config.limit_velocity, config.max_velocity)
+
+    def _tell(self, what, *arguments):
+        getattr(self.controller, what)(*arguments)
+        if self.log is not None:
+            self.log.append((what, *arguments))
+
+    def tick(self, step=PERIOD, state=None, goal=None, verdict=None, interlocks=()):
         """Update once; a verdict on the state is only given where it is no list of numbers."""
         config, policy, counted = self.config, self.policy, self.seen
         now = self.now + step
         policy.forget()
-        command = self.controller.update(now, state, goal)
+        command = self.controller.update(now, state, goal, interlocks)
         if self.log is not None:
             velocity = None if command.velocity is None else command.velocity.tobytes()
-            self.log.append(("update", now, state, goal, policy.trouble, velocity, command.state, command.reasons))
+            inputs = (now, state, goal, interlocks)
+            self.log.append(("update", inputs, policy.trouble, velocity, command.state, command.reasons))
         stop, elapsed = self._take_time(now)
         said = [" ".join(reason.split()[:2]) for reason in command.reasons]
         # What came in.
@@ -128,11 +145,22 @@ class World:
         velocity = STILL if command.velocity is None else command.velocity.tolist()
         assert (command.velocity is None) == (self.accepted is None and not self.latched)
         if self.latched:
-            expected, stop = self.latched, True
-        elif self.accepted is None or (self.goal is None and not self.needed):
-            expected, stop = State.WAITING, True
+            expected = self.latched
+        elif self.accepted is None:
+            expected = State.WAITING
         elif self.needed:
-            expected, stop = State.HOLD, True
+            expected = State.HOLD
+        elif interlocks or self.goal is None:
+            expected = State.WAITING
+            counted["interlocked"] += self.goal is not None
+            assert set(interlocks) <= set(command.reasons)
+            assert ("no goal" in said) == (self.goal is None)
+        else:
+            expected = None
+        if expected:
+            stop = True
+            assert policy.measured is None
+            assert not policy.called
         else:
             expected, stop = self._drive(stop)
         assert command.state is expected, (command, expected)
@@ -143,7 +171,7 @@ class World:
             assert velocity == STILL, command
             assert command.reasons or expected is State.REACHED
         self._check(velocity, elapsed, stop, "a joint" in said)
-        self.velocity = velocity
+        self.velocity = self.last = velocity
         return command
 
     def finish(self):
@@ -210,21 +238,31 @@ class World:
         if before is not None:
             elapsed = state.stamp - before[1]
             allowed = min(elapsed, max(0.0, received - before[2]) + self.config.state_timeout)
-            moves = zip(position, before[0], self.plausible, strict=True)
-            if elapsed <= 0 or any(abs(q - p) > speed * allowed + 0.01 for q, p, speed in moves):
+            moved = self._moved(position, before[0])
+            far = any(abs(by) > speed * allowed + 0.01 for by, speed in zip(moved, self.plausible, strict=True))
+            if elapsed <= 0 or far:
                 return "implausible"
+            self.seen["around"] += any(abs(q - p) > 3 for q, p in zip(position, before[0], strict=True))
         velocity = [state.velocity[i] for i in index] if len(state.velocity) else [math.nan] * 2
         if not all(map(math.isfinite, velocity)):
             if not self.config.allow_velocity_estimate or before is None or elapsed > self.config.state_timeout:
                 return "malformed"
-            rows = zip(velocity, position, before[0], self.plausible, strict=True)
-            velocity = [v if math.isfinite(v) else min(most, max(-most, (q - p) / elapsed)) for v, q, p, most in rows]
+            rows = zip(velocity, moved, self.plausible, strict=True)
+            velocity = [v if math.isfinite(v) else min(most, max(-most, by / elapsed)) for v, by, most in rows]
         if any(abs(v) > speed for v, speed in zip(velocity, self.plausible, strict=True)):
             return "implausible"
         if self.now - received > self.config.state_timeout:
             return "implausible"
         self.accepted, self.received = position, received
         return "good"
+
+    def _moved(self, position, before):
+        """By how much: a joint without limits the shorter way around."""
+        moves = [q - p for q, p in zip(position, before, strict=True)]
+        return [
+            math.remainder(by, math.tau) if math.isinf(upper) else by
+            for by, upper in zip(moves, self.upper, strict=True)
+        ]
 
     def _drive(self, stop):
         """Return the state, and whether the arm stands in this tick."""
@@ -256,7 +294,7 @@ class World:
             margin = self.config.limit_margin
             sides = [(q >= upper - margin) - (q <= lower + margin) for q, lower, upper in self._against_limits()]
         beyond = any(sides) and any(not lower <= q <= upper for q, lower, upper in self._against_limits())
-        for new, last, side in zip(velocity, self.velocity, sides, strict=True):
+        for new, last, side in zip(velocity, self.last, sides, strict=True):
             assert abs(new) <= self.fastest  # so, it is finite
             self.seen["at a limit"] += side != 0 and not stopped
             assert new * side <= 0, (new, side)
@@ -270,7 +308,7 @@ class World:
             assert held_back or not beyond
             if beyond:  # as slow as the acceleration limit allows
                 self.seen["beyond a limit"] += 1
-                fastest = max(map(abs, self.velocity))
+                fastest = max(map(abs, self.last))
                 share = min(1.0, change / (fastest + self.slow))
                 allowed = self.slow + max(0.0, fastest - self.slow) * (1 - share)
                 assert max(map(abs, velocity)) <= allowed + 1e-12
@@ -324,6 +362,17 @@ def offset(world, rng):
     return {"position": q}
 
 
+def counted_to_half_a_turn(world, rng, tick):
+    """As drivers do that know no turns; the first joint goes to and fro where it jumps from one half to the other."""
+    if not tick:
+        world.position = [rng.choice((-1, 1)) * rng.uniform(3.1, 3.14), rng.uniform(-2, 2)]
+    world.flow(PERIOD)
+    world.position[0] = math.remainder(world.position[0], math.tau)
+    onward = np.array([math.copysign(2.0, world.position[0]), 0.0])
+    world.policy.trouble = lambda command: onward
+    world.tick(PERIOD, world.message())
+
+
 def teleport(place):
     def happen(world, rng, tick):
         world.flow(PERIOD)
@@ -336,10 +385,7 @@ def teleport(place):
 
 def at_limit(low, high):
     def place(world, rng):
-        side, joint = rng.choice((-1, 1)), rng.randrange(2)
-        q = [rng.uniform(-3, 3), rng.uniform(-2, 2)]
-        q[joint] = side * (world.upper[joint] + rng.uniform(low, high))
-        return q
+        return [rng.uniform(-9, 9), rng.choice((-1, 1)) * (world.upper[1] + rng.uniform(low, high))]
 
     return place
 
@@ -425,6 +471,34 @@ def reset(world, rng, tick):
     well(world, rng, tick)
 
 
+def forget_goal(world, rng, tick):
+    if not tick:
+        world.forget_goal()
+    well(world, rng, tick)
+
+
+def interlocked(world, rng, tick):
+    """With all that may come in meanwhile."""
+    world.flow(PERIOD, (rng.gauss(0, 1e-3), 0.0))
+    state = world.message() if rng.random() < 0.9 else None
+    new = Goal(*on_ring(rng)) if rng.random() < 0.1 else None
+    world.tick(PERIOD, state, new, interlocks=rng.choice((("not enabled",), ["not enabled", "a person is near"])))
+
+
+def configured(world, rng, tick):
+    if not tick:
+        world.configure(other_config(rng))
+    well(world, rng, tick)
+
+
+def configured_wrongly(world, rng, tick):
+    """What is refused changes nothing, as the ticks that follow show."""
+    bad = rng.choice(({"max_velocity": 2.6}, {"clock_jump": 0.05}, {"limit_margin": 2.7}, {"state_timeout": 10.0}))
+    with pytest.raises(UserError):
+        world.controller.configure(dataclasses.replace(other_config(rng), **bad))
+    well(world, rng, tick)
+
+
 def reset_with_goal(world, rng, tick):
     if not tick:
         world.reset()
@@ -477,6 +551,7 @@ EVENTS = {
     "stamp ahead and position jump": sends(
         lambda w, rng: {"stamp": w.stamp + rng.choice((0.1, 1.0, 3600.0)), **offset(w, rng)}
     ),
+    "counted to half a turn": counted_to_half_a_turn,
     "arm elsewhere": teleport(anywhere),
     "arm in a margin": teleport(at_limit(-0.12, 0.0)),
     "arm beyond a limit": teleport(at_limit(0.0, 0.15)),
@@ -501,14 +576,21 @@ EVENTS = {
     "emergency stop": emergency,
     "reset": reset,
     "reset, then a goal": reset_with_goal,
+    "goal forgotten": forget_goal,
+    "interlocked": interlocked,
+    "configured": configured,
+    "configured wrongly": configured_wrongly,
 }
 LENGTHS = {
     "policy pushes outward": 300,
     "policy shakes": 100,
-    "policy to and fro at a limit": 200,
+    "policy to and fro at a limit": 300,
+    "counted to half a turn": 60,
     "arm in a margin": 50,
     "arm beyond a limit": 100,
     "reset": 1,
+    "goal forgotten": 1,
+    "configured wrongly": 1,
 }
 
 
@@ -522,6 +604,20 @@ def random_config(rng):
         recovery_states=5 if usual else rng.choice((2, 5, 9)),
         allow_velocity_estimate=rng.random() < 0.5,
         unreachable_goal=rng.choice(("reject", "project")),
+    )
+
+
+def other_config(rng):
+    """One that differs in what usually stays, too."""
+    return dataclasses.replace(
+        random_config(rng),
+        state_timeout=rng.choice((0.05, 0.07, 0.1)),
+        jump_factor=rng.choice((1.5, 3.0)),
+        limit_margin=rng.choice((0.165, 0.2)),
+        limit_velocity=rng.choice((0.02, 0.05, 1.0)),
+        limit_fault=rng.choice((0.16, 0.2)),
+        reached_hysteresis=rng.choice((1.0, 1.5, 3.0)),
+        policy_failures=rng.choice((1, 3, 5)),
     )
 
 
@@ -576,7 +672,7 @@ def test_a_million_updates_keep_the_contract(policy, seed):
     for event in EVENTS:
         assert seen[event] >= 10, event
     sights = ("at a limit", "stopped at a limit", "beyond a limit", "held back", "goal projected", "goal rejected")
-    for sight in ("good", "malformed", "implausible", "holds", *sights):
+    for sight in ("good", "malformed", "implausible", "holds", "interlocked", "around", *sights):
         assert seen[sight] >= 100, sight
 
 
@@ -592,12 +688,12 @@ def test_the_same_inputs_give_the_same_outputs_bit_for_bit(policy, real):
             controller = Controller(troubled_policy, *entry, troubled_policy.stopwatch)
             troubled_policy.stop = controller.emergency_stop
         elif kind == "update":
-            now, state, new_goal, troubled_policy.trouble, *expected = entry
-            command = controller.update(now, state, new_goal)
+            inputs, troubled_policy.trouble, *expected = entry
+            command = controller.update(*inputs)
             velocity = None if command.velocity is None else command.velocity.tobytes()
             assert [velocity, command.state, command.reasons] == expected
         else:
-            getattr(controller, kind)()
+            getattr(controller, kind)(*entry)
 
 
 happenings = st.lists(

@@ -1,3 +1,4 @@
+import dataclasses
 import math
 
 import numpy as np
@@ -13,7 +14,7 @@ NAMES = ("joint1", "joint2")
 
 @pytest.fixture(scope="module")
 def metadata(policy):
-    return policy.metadata  # two joints, of 2.5 rad/s
+    return policy.metadata  # two joints, of 2.5 rad/s; the first turns without end
 
 
 @pytest.fixture
@@ -171,10 +172,66 @@ def test_a_position_that_jumped_is_implausible(reader, joint, sign):
 
 def test_how_far_a_joint_can_move_grows_with_time_and_factor(reader, metadata):
     read(reader)
-    assert_reads(reader, state((0.1 + 7.4, 0.2), stamp=1.0), [7.5, 0.2], [0.3, 0.4])
+    assert_reads(reader, state((0.1, 0.2 + 7.4), stamp=1.0), [0.1, 7.6], [0.3, 0.4])
     strict = JointReader(metadata, ControllerConfig(jump_factor=1.0))
     read(strict)
     assert rejection(strict, (0.1 + 2.6, 0.2), stamp=1.0, implausible=True) == "position jump"
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_a_continuous_joint_may_be_counted_from_half_a_turn_to_half_a_turn(estimating, sign):
+    read(estimating, (sign * 3.13, 0.2))
+    speed = sign * (2 * math.pi - 6.26) / 0.02
+    assert_reads(estimating, state((-sign * 3.13, 0.2), (), 0.02), [-sign * 3.13, 0.2], [speed, 0.0])
+    assert_reads(estimating, state((sign * 3.13, 0.2), (), 0.04), [sign * 3.13, 0.2], [-speed, 0.0])
+
+
+@given(st.floats(-50, 50), st.integers(-9, 9), st.floats(-math.pi, math.pi), st.sampled_from([0.02, 0.1, 0.3]))
+def test_a_continuous_joint_has_moved_the_shorter_way_around(metadata, start, turns, moved, elapsed):
+    joint_reader = JointReader(metadata, ControllerConfig(allow_velocity_estimate=True, state_timeout=1.0))
+    read(joint_reader, (start, 0.2))
+    there = (start + moved + turns * 2 * math.pi, 0.2)
+    if abs(abs(moved) - 7.5 * elapsed - 0.01) < 1e-9:
+        return  # on the very edge, rounding decides
+    if abs(moved) > 7.5 * elapsed + 0.01:
+        assert rejection(joint_reader, there, stamp=elapsed, implausible=True) == "position jump"
+    else:
+        _, velocity = read(joint_reader, there, (), elapsed)
+        np.testing.assert_allclose(velocity, [np.clip(moved / elapsed, -7.5, 7.5), 0.0], atol=1e-9)
+
+
+def test_a_jump_of_a_continuous_joint_is_told_as_the_shorter_way_around(reader):
+    read(reader)
+    with pytest.raises(JointStateError, match=r"'joint1' jumped by -1\.000 rad in 0\.020 s"):
+        read(reader, (0.1 - 1.0 + 4 * math.pi, 0.2), stamp=0.02)
+
+
+@pytest.mark.parametrize("limit", [(-2.6, 2.6), (-2.6, math.inf), (-math.inf, 2.6)])
+def test_a_joint_with_a_limit_cannot_turn_around(metadata, limit):
+    limited = dataclasses.replace(metadata, position_limit=np.array([(-math.inf, math.inf), limit]))
+    joint_reader = JointReader(limited, ControllerConfig())
+    read(joint_reader)
+    assert rejection(joint_reader, (0.1, 0.2 - 2 * math.pi), stamp=0.02, implausible=True) == "position jump"
+
+
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")
+@pytest.mark.parametrize("joint", [0, 1])
+def test_a_jump_too_far_for_a_float_is_a_jump(reader, joint):
+    positions = np.zeros((2, 2))
+    positions[:, joint] = -1.7e308, 1.7e308
+    read(reader, positions[0])
+    assert rejection(reader, positions[1], stamp=0.02, implausible=True) == "position jump"
+
+
+def test_configured_anew_it_keeps_the_last_state_and_judges_the_next_by_the_new_values(reader):
+    read(reader)
+    reader.configure(ControllerConfig(jump_factor=1.0))
+    assert rejection(reader, (0.1, 0.2 + 0.07), stamp=0.02, implausible=True) == "position jump"
+    assert rejection(reader, velocity=(2.6, 0.0), stamp=0.06, implausible=True) == "velocity implausible"
+    reader.configure(ControllerConfig(allow_velocity_estimate=True))
+    assert_reads(reader, state((0.11, 0.195), (), 0.08), [0.11, 0.195], [0.5, -0.25])
+    reader.configure(ControllerConfig(allow_velocity_estimate=True, state_timeout=0.01))
+    assert rejection(reader, velocity=(), stamp=0.1) == "velocity missing"
 
 
 @pytest.mark.parametrize(
@@ -231,6 +288,7 @@ states = st.builds(
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")
 @given(st.lists(states, max_size=5))
 @example([JointState(NAMES, (0.0, 0.0), (), 0.0), JointState(NAMES, (1e-9, 0.0), (), 5e-324)])
+@example([JointState(NAMES, (0.0, -1e308), (), 0.0), JointState(NAMES, (0.0, 1e308), (), 0.02)])
 def test_whatever_comes_is_rejected_or_read_as_finite_plausible_numbers(metadata, messages):
     joint_reader = JointReader(metadata, ControllerConfig(allow_velocity_estimate=True))
     for message in messages:

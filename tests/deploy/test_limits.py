@@ -1,5 +1,4 @@
 import dataclasses
-import math
 
 import numpy as np
 import pytest
@@ -15,7 +14,8 @@ STILL, MIDDLE = np.zeros(2), np.array([0.5, 1.0])
 
 @pytest.fixture(scope="module")
 def metadata(policy):
-    return policy.metadata  # positions of 6.2832 and 2.6 rad, commands of 2 rad/s
+    """Of an arm whose first joint has limits, too: positions of 6.2832 and 2.6 rad, commands of 2 rad/s."""
+    return dataclasses.replace(policy.metadata, position_limit=np.array([[-6.2832, 6.2832], [-2.6, 2.6]]))
 
 
 @pytest.fixture(scope="module")
@@ -119,9 +119,8 @@ def test_farther_beyond_a_limit_than_limit_fault_is_far(limits):
     assert limits.far_beyond(np.array([-6.5, 0.0])) == 0
 
 
-def test_a_continuous_joint_has_no_limits(metadata):
-    free = dataclasses.replace(metadata, position_limit=np.array([[-math.inf, math.inf], [-2.6, 2.6]]))
-    limits = VelocityLimits(free, ControllerConfig())
+def test_a_continuous_joint_has_no_limits(policy):
+    limits = VelocityLimits(policy.metadata, ControllerConfig())
     assert limits.far_beyond(np.array([1e6, 0.0])) is None
     np.testing.assert_array_equal(apply(limits, [0.2, 0.2], [-1e6, 0.0]), [0.2, 0.2])
 

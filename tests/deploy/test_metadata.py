@@ -77,7 +77,7 @@ def refusal(text: str) -> str:
 def test_all_that_a_controller_needs_is_there(good):
     metadata = Metadata.parse(json.dumps(good))
     assert (metadata.robot, metadata.joints) == ("planar_arm", ("joint1", "joint2"))
-    assert metadata.position_limit.tolist() == [[-6.2832, 6.2832], [-2.6, 2.6]]
+    assert metadata.position_limit.tolist() == [[-math.inf, math.inf], [-2.6, 2.6]]
     assert metadata.velocity_limit.shape == metadata.effort_limit.shape == metadata.command_limit.shape == (2,)
     assert (metadata.control_rate, metadata.goal_frame) == (50.0, "base")
     assert metadata.goal_radius[0] < metadata.goal_radius[1]

@@ -1,11 +1,15 @@
 import dataclasses
 import math
 import re
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from physai.deploy import Controller, ControllerConfig
+from physai.deploy.parameters import Parameters, parameter
 from physai.errors import UserError
 
 FIELDS = {field.name: field for field in dataclasses.fields(ControllerConfig)}
@@ -36,7 +40,7 @@ def test_the_defaults_are_those_of_the_contract():
 @pytest.mark.parametrize("name", FIELDS)
 def test_every_field_says_its_unit_range_and_meaning(name):
     metadata = FIELDS[name].metadata
-    assert set(metadata) == {"unit", "low", "high", "description"}
+    assert set(metadata) == {"unit", "low", "high", "description", "choices", "fixed"}
     assert metadata["description"]
     assert isinstance(metadata["unit"], str)
     if name in FLOATS and name not in ("jump_factor", "reached_hysteresis"):
@@ -112,7 +116,106 @@ def test_a_config_cannot_be_changed():
         ControllerConfig().max_velocity = 100.0
 
 
-# What the controller refuses, since it does not fit its robot: of 2.5 rad/s, 6.2832 and 2.6 rad, at 50 Hz.
+def test_all_that_is_wrong_is_named_in_one_line():
+    assert refusal(max_velocity=1e3, recovery_states=2.5, state_timeout=0.2, unreachable_goal="clamp") == (
+        "max_velocity: must lie between 0.001 and 100 rad/s, got 1000.0; "
+        "recovery_states: a int is needed, got 2.5; "
+        "unreachable_goal: must be 'reject' or 'project', got 'clamp'"
+    )
+
+
+# Parameters of other kinds.
+
+
+@dataclass(frozen=True)
+class Other(Parameters):
+    rate: float = parameter(50.0, "how often", "Hz", 1.0, 1e3)
+    count: int = parameter(3, "how many", low=1, high=9)
+    enabled: bool = parameter(False, "whether", fixed=True)
+    topic: str = parameter("", "any text")
+    mode: str = parameter("slow", "how", choices=("slow", "fast"))
+    names: tuple[str, ...] = parameter((), "any texts")
+    gains: tuple[float, ...] = parameter((1.0, 2.0), "some numbers", low=-1.0, high=5.0)
+
+
+OTHERS = {field.name: field for field in dataclasses.fields(Other)}
+WANTED = {  # said again, in other words
+    "rate": lambda value: type(value) in (int, float) and 1 <= value <= 1000,
+    "count": lambda value: type(value) is int and 1 <= value <= 9,
+    "enabled": lambda value: type(value) is bool,
+    "topic": lambda value: type(value) is str,
+    "mode": lambda value: value in ("slow", "fast"),
+    "names": lambda value: type(value) in (list, tuple) and all(type(x) is str for x in value),
+    "gains": lambda value: (
+        type(value) in (list, tuple) and all(type(x) in (int, float) and -1 <= x <= 5 for x in value)
+    ),
+}
+
+
+def refusal_of_other(**values):
+    with pytest.raises(UserError) as caught:
+        Other(**values)
+    return str(caught.value)
+
+
+def test_what_is_declared_is_kept_with_the_field():
+    assert OTHERS["rate"].metadata["unit"] == "Hz"
+    assert OTHERS["mode"].metadata["choices"] == ("slow", "fast")
+    assert [name for name, field in OTHERS.items() if field.metadata["fixed"]] == ["enabled"]
+
+
+def test_a_list_becomes_a_tuple_and_ints_in_it_the_floats_that_are_wanted():
+    taken = Other(names=["a", "b"], gains=[0, 1.5])
+    assert (taken.names, taken.gains) == (("a", "b"), (0.0, 1.5))
+    assert [type(gain) for gain in taken.gains] == [float, float]
+    assert Other(names=[], gains=()).names == ()
+
+
+def test_numbers_of_numpy_will_do_for_floats():
+    taken = Other(rate=np.float64(2.5), gains=list(np.array([0.5, 1.0])))
+    assert [type(number) for number in (taken.rate, *taken.gains)] == [float] * 3
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"names": "ab"}, "names: a tuple is needed, got 'ab'"),
+        ({"names": ["a", 1]}, "names: a list of str is needed, got ['a', 1]"),
+        ({"gains": 1.0}, "gains: a tuple is needed, got 1.0"),
+        ({"gains": [1.0, "2"]}, "gains: a list of float is needed, got [1.0, '2']"),
+        ({"gains": [True]}, "gains: a list of float is needed, got [True]"),
+        ({"gains": [1.0, 5.5]}, "gains: must lie between -1 and 5, got (1.0, 5.5)"),
+        ({"gains": [math.nan]}, "gains: must lie between -1 and 5, got (nan,)"),
+        ({"mode": "Slow"}, "mode: must be 'slow' or 'fast', got 'Slow'"),
+        ({"mode": None}, "mode: a str is needed, got None"),
+    ],
+)
+def test_a_list_or_a_word_that_is_not_wanted_is_refused_in_a_line_that_names_it(values, message):
+    assert refusal_of_other(**values) == message
+
+
+plain = st.none() | st.booleans() | st.integers(-10, 10) | st.integers() | st.floats() | st.text(max_size=9)
+anything = plain | st.sampled_from(["slow", "fast", 10**400]) | st.lists(plain, max_size=3)
+
+
+@given(st.dictionaries(st.sampled_from(list(OTHERS)), anything))
+def test_whatever_is_given_is_taken_as_its_type_or_refused_in_one_line_that_names_all_of_it(values):
+    bad = [name for name in OTHERS if name in values and not WANTED[name](values[name])]
+    try:
+        taken = Other(**values)
+    except UserError as error:
+        lines = str(error).splitlines()
+        assert len(lines) == 1
+        assert re.findall(r"(?:^|; )(\w+): (?:a|must) ", re.sub(r"'[^']*'|\"[^\"]*\"", "''", lines[0])) == bad
+    else:
+        assert not bad
+        for name, field in OTHERS.items():
+            value = getattr(taken, name)
+            assert type(value) is type(field.default)
+            assert value == (tuple(values[name]) if isinstance(values.get(name), list) else values.get(name, field.default))
+
+
+# What the controller refuses, since it does not fit its robot: of 2.5 rad/s, a joint of 2.6 rad, at 50 Hz.
 
 
 @dataclasses.dataclass

@@ -241,6 +241,15 @@ def speeds(physics, parameters, steps, qd=0.0, command=1.0):
     return run(physics, np.full((steps, *shape), command))[:, 1]
 
 
+def test_a_continuous_joint_turns_without_end(planar, make):
+    physics = make(planar, 2)
+    reset_all(physics, np.zeros((2, 2)), np.zeros((2, 2)))
+    there_and_back = np.array([[2.0, 0.0], [-2.0, 0.0]])
+    q, qd = run(physics, np.repeat(there_and_back[None], 1000, axis=0))[-1]
+    np.testing.assert_allclose(q[:, 0], [40.0, -40.0], rtol=0.01)  # more than six turns
+    np.testing.assert_allclose(qd, there_and_back, atol=0.02)
+
+
 def test_less_effort_speeds_up_more_slowly(planar, make):
     physics = make(planar, 3)
     found = speeds(physics, dynamics(planar, 3, effort_limit=[0.5, 1.0, 5.0], joint_friction=0.0), 3)[0, :, 0]

@@ -47,16 +47,24 @@ def test_the_planar_arm_is_what_its_urdf_says():
     assert spec.joints == ("joint1", "joint2")
     assert spec.moving_links == ("link1", "link2", "tool")
     np.testing.assert_allclose(spec.link_mass, [1.0, 0.6, 0.05])
-    np.testing.assert_allclose(spec.position_limit, [[-6.2832, 6.2832], [-2.6, 2.6]])
+    assert spec.position_limit.tolist() == [[-math.inf, math.inf], [-2.6, 2.6]]
+    assert spec.continuous.tolist() == [True, False]
     np.testing.assert_allclose(spec.effort_limit, [5.0, 3.0])
     np.testing.assert_allclose(spec.velocity_limit, [2.5, 2.5])
     np.testing.assert_allclose(spec.damping, [0.05, 0.03])
     np.testing.assert_allclose(spec.friction, [0.05, 0.03])
 
 
-def test_a_continuous_joint_has_infinite_limits(path):
-    path.write_text(replaced('<joint name="joint1" type="revolute">', '<joint name="joint1" type="continuous">'))
-    assert spec_of(path).position_limit.tolist() == [[-math.inf, math.inf], [-2.6, 2.6]]
+def test_a_continuous_joint_has_no_limits_whatever_its_limit_says(path):
+    path.write_text(replaced('<joint name="joint2" type="revolute">', '<joint name="joint2" type="continuous">'))
+    spec = spec_of(path)
+    assert spec.position_limit.tolist() == [[-math.inf, math.inf]] * 2
+    assert spec.continuous.tolist() == [True, True]
+    np.testing.assert_allclose(spec.effort_limit, [5.0, 3.0])
+
+
+def test_the_kuka_turns_no_joint_without_end(kuka_reacher):
+    assert RobotSpec.from_config(kuka_reacher.robot).continuous.tolist() == [False, False]
 
 
 def test_a_missing_file_is_named(tmp_path):
@@ -101,6 +109,8 @@ def test_a_missing_file_in_a_package_is_named():
         (replaced('iyy="0.00316"', 'iyy="x"'), ["link2", "inertia", "'x'"]),
         (TEXT.replace(LINK2, '<link name="link2"/>'), ["link2", "<inertial>"]),
         (replaced('lower="-2.6"', 'lower="3"'), ["joint2", "lower", "upper"]),
+        (replaced('type="continuous"', 'type="revolute"'), ["joint1", "lower", "upper"]),
+        (replaced('<limit velocity="2.5" effort="5.0"/>', ""), ["joint1", "<limit>"]),
         (replaced('effort="3.0"', 'effort="0"'), ["joint2", "effort"]),
         (replaced('velocity="2.5"', 'velocity="fast"', 'name="joint2"'), ["joint2", "velocity", "fast"]),
         (

@@ -3,6 +3,8 @@ import math
 import numpy as np
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 from scipy import stats
 
 from physai.envs.simulation import Simulation
@@ -29,6 +31,13 @@ def simulate(env_config):
     yield make
     for simulation in made:
         simulation.close()
+
+
+@pytest.fixture(scope="module")
+def turning(reacher):
+    """What an arm whose first joint is continuous, and whose second is not, observes."""
+    spec = RobotSpec.from_config(reacher.robot)
+    return Reach([0.3, 0.53], 0.05, 10.0, 200, [3.1, 2.5]).observation(spec, ForwardKinematics(spec))
 
 
 def put_goal_at_the_tip(simulation, row):
@@ -77,12 +86,13 @@ def test_starts_are_uniform_around_home_and_stay_within_the_joint_limits(any_env
 
 
 def test_distance_counts_in_the_plane_only(task, kuka_reacher):
-    kinematics = ForwardKinematics(RobotSpec.from_config(kuka_reacher.robot))
+    spec = RobotSpec.from_config(kuka_reacher.robot)
+    kinematics = ForwardKinematics(spec)
     q = torch.tensor([[0.0, 0.5], [1.0, -0.8]])
     end_effector = kinematics(q)
     assert (end_effector[:, 2] > 0.5).all()
     goal = end_effector[:, :2] + torch.tensor([[0.3, 0.4], [-0.6, 0.8]])
-    torch.testing.assert_close(task.observation(kinematics).distance(q, goal), torch.tensor([[0.5], [1.0]]))
+    torch.testing.assert_close(task.observation(spec, kinematics).distance(q, goal), torch.tensor([[0.5], [1.0]]))
 
 
 def test_reward_and_success_are_the_numbers_of_the_contract(task):
@@ -93,9 +103,19 @@ def test_reward_and_success_are_the_numbers_of_the_contract(task):
     torch.testing.assert_close(task.reward(distance, success), expected)
 
 
-def test_the_observation_is_positions_velocities_tip_and_goal(reacher):
-    kinematics = ForwardKinematics(RobotSpec.from_config(reacher.robot))
-    module = Reach([0.3, 0.53], 0.05, 10.0, 200, [3.1, 2.5]).observation(kinematics)
+@pytest.fixture
+def observe(task, env_config):
+    """Make the observation module of an env's robot."""
+
+    def make(name="reacher"):
+        spec = RobotSpec.from_config(env_config(name).robot)
+        return task.observation(spec, ForwardKinematics(spec))
+
+    return make
+
+
+def test_the_observation_is_positions_velocities_tip_and_goal(observe):
+    module = observe()
     q, qd, goal = torch.tensor([[0.0, math.pi / 2]]), torch.tensor([[0.5, -1.0]]), torch.tensor([[0.1, 0.2]])
     observation, features = module(q, qd, goal)
     expected = torch.tensor([[0.0, math.pi / 2, 0.5, -1.0, 0.30, 0.25, 0.1, 0.2]])
@@ -103,13 +123,41 @@ def test_the_observation_is_positions_velocities_tip_and_goal(reacher):
     assert features.shape == (1, 12)
 
 
-def test_the_scripted_observation_equals_eager_bit_for_bit(any_env):
-    spec = RobotSpec.from_config(any_env.robot)
-    module = Reach([0.3, 0.5], 0.05, 10.0, 200, [1.0, 1.0]).observation(ForwardKinematics(spec))
+@given(st.floats(-math.pi, math.pi), st.integers(-50, 50), st.floats(-2.6, 2.6))
+def test_an_arm_that_has_turned_around_looks_like_one_that_has_not(turning, angle, turns, elbow):
+    q = torch.tensor([[angle, elbow], [angle + 2 * math.pi * turns, elbow]])
+    rest = torch.tensor([[0.5, -1.0]] * 2), torch.tensor([[0.1, 0.2]] * 2)
+    observation, features = turning(q, *rest)
+    assert observation[:, 0].abs().max() <= math.pi + 1e-6
+    observation[:, 0] = torch.remainder(observation[:, 0] - angle + 1.0, 2 * math.pi)  # both ends are the same
+    torch.testing.assert_close(observation[0], observation[1], rtol=0, atol=2e-4)
+    torch.testing.assert_close(features[0], features[1], rtol=0, atol=1e-2)  # some of them count in tolerances
+
+
+def test_positions_of_joints_with_limits_are_observed_as_they_are(observe):
+    rest = torch.zeros(1, 2), torch.tensor([[0.1, 0.2]])
+    assert observe()(torch.tensor([[4.0, 4.0]]), *rest)[0][0, :2].tolist() == pytest.approx([4.0 - 2 * math.pi, 4.0])
+    assert observe("kuka_reacher")(torch.tensor([[4.0, -5.0]]), *rest)[0][0, :2].tolist() == [4.0, -5.0]
+
+
+def test_observations_have_finite_bounds_that_hold_after_many_turns(task, reacher):
+    spec = RobotSpec.from_config(reacher.robot)
+    kinematics = ForwardKinematics(spec)
+    lower, upper = task.observation_bounds(spec, kinematics)
+    assert torch.isfinite(lower).all()
+    assert torch.isfinite(upper).all()
+    q = torch.stack([torch.linspace(-1000, 1000, 5000), torch.linspace(-2.6, 2.6, 5000)], dim=1)
+    observation, _ = task.observation(spec, kinematics)(q, torch.zeros_like(q), task.sample_goal(5000, torch.Generator()))
+    assert ((lower <= observation) & (observation <= upper)).all()
+    assert spec.position_limit[0].tolist() == [-math.inf, math.inf]  # what it says of the robot is left alone
+
+
+def test_the_scripted_observation_equals_eager_bit_for_bit(any_env, observe):
+    module = observe(any_env.name)
     scripted = torch.jit.script(module)
     generator = torch.Generator().manual_seed(0)
     for _ in range(4):
-        sensed = [torch.randn(5, 2, generator=generator) for _ in range(3)]
+        sensed = [5 * torch.randn(5, 2, generator=generator) for _ in range(3)]
         for ours, theirs in zip(module(*sensed), scripted(*sensed), strict=True):
             assert torch.equal(ours, theirs)
 

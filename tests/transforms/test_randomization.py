@@ -6,9 +6,9 @@ from scipy import stats
 from physai.config import compose, validate
 from physai.envs.make import make
 from physai.errors import UserError
-from physai.physics import ParameterLayout
+from physai.physics import ParameterLayout, RandomizationConfig
 from physai.robots import RobotSpec
-from physai.transforms import DomainRandomization, RandomizationConfig
+from physai.transforms import DomainRandomization
 
 NOTHING = dict.fromkeys(
     (

@@ -1,0 +1,68 @@
+"""What the inference node tells about itself on /diagnostics (diagnostic_msgs, REP-107)."""
+
+from typing import Any
+
+import numpy as np
+from builtin_interfaces.msg import Time
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+
+from physai.deploy import Policy, State
+
+_LEVELS = {
+    State.WAITING.value: DiagnosticStatus.OK,
+    State.ACTIVE.value: DiagnosticStatus.OK,
+    State.REACHED.value: DiagnosticStatus.OK,
+    State.HOLD.value: DiagnosticStatus.WARN,
+    State.FAULT.value: DiagnosticStatus.ERROR,
+    State.ESTOP.value: DiagnosticStatus.ERROR,
+}
+
+
+class Timing:
+    """Rate and jitter of the last updates.
+
+    Args:
+        length: How many are looked at.
+
+    Attributes:
+        last: Time of the last update, s.
+    """
+
+    def __init__(self, length: int = 100) -> None:
+        self.last = -np.inf
+        self._periods = np.full(length, np.nan)
+        self._next = 0
+
+    def tick(self, now: float) -> None:
+        """Count an update at a time, s."""
+        if np.isfinite(self.last):
+            self._periods[self._next] = now - self.last
+            self._next = (self._next + 1) % len(self._periods)
+        self.last = now
+
+    def summary(self) -> dict[str, float | None]:
+        """Mean rate, Hz, and the longest distance of a period from the mean, ms; None before the second update."""
+        periods = self._periods[np.isfinite(self._periods)]
+        if not len(periods):
+            return {"rate_hz": None, "jitter_ms": None}
+        mean = periods.mean()
+        return {"rate_hz": round(1.0 / mean, 2), "jitter_ms": round(1e3 * float(np.abs(periods - mean).max()), 3)}
+
+
+def diagnose(name: str, stamp: Time, policy: Policy, values: dict[str, Any]) -> DiagnosticArray:
+    """Make the message from ``values``: a controller's snapshot, and whatever else is to be told."""
+    flat = {**values, **{f"count: {key}": count for key, count in sorted(values["counters"].items())}}
+    status = DiagnosticStatus(
+        level=_LEVELS[values["state"]],
+        name=f"{name}: arm",
+        message=": ".join([values["state"], "; ".join(values["reasons"])][: 2 if values["reasons"] else 1]),
+        hardware_id=policy.metadata.robot,
+        values=[
+            KeyValue(key=key, value="" if value is None else str(value))
+            for key, value in flat.items()
+            if key not in ("state", "reasons", "counters")
+        ],
+    )
+    message = DiagnosticArray(status=[status])
+    message.header.stamp = stamp
+    return message

@@ -1,0 +1,266 @@
+"""The node that drives a robot: joint states and goals in, joint velocities out, 50 times a second."""
+
+import sys
+import time
+from dataclasses import dataclass
+
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PointStamped
+from rclpy.clock import Clock, ClockType
+from rclpy.event_handler import SubscriptionEventCallbacks
+from sensor_msgs.msg import JointState as JointStateMessage
+from std_msgs.msg import Bool, String
+from std_srvs.srv import SetBool, Trigger
+
+from physai.deploy import Command, Controller, ControllerConfig, Goal, JointState, Policy, State, load_policy
+from physai.deploy.goals import GoalError, accept
+from physai.deploy.parameters import parameter
+from physai.errors import UserError
+from physai.ros import qos
+from physai.ros.commands import VelocityCommands
+from physai.ros.diagnostics import Timing, diagnose
+from physai.ros.parameters import declare
+from physai.ros.run import StoppableNode, run
+
+_DISCOVERY = 0.5  # s; the slowest of all discoveries that were measured took 0.4
+
+
+@dataclass(frozen=True)
+class InferenceConfig(ControllerConfig):
+    """Parameters of the inference node: those of the controller, and these."""
+
+    policy_path: str = parameter("", "policy.pt of a run (required)", fixed=True)
+    policy_sha256: str = parameter("", "its hash, which proves where it comes from", fixed=True)
+    joints: tuple[str, ...] = parameter(
+        (), "joints of the commands, in the controller's order; empty: the policy's", fixed=True
+    )
+    rate_hz: float = parameter(50.0, "commands per second; at least the policy's rate", "Hz", 1.0, 1000.0, fixed=True)
+    trigger: str = parameter("timer", "what a command answers to", choices=("timer", "joint_state"), fixed=True)
+    autostart: bool = parameter(False, "drive without waiting for ~/enable", fixed=True)
+    goal: tuple[float, ...] = parameter(
+        (), "x and y of a goal to start with, in the policy's frame; empty: none", "m", -100.0, 100.0, fixed=True
+    )
+
+
+class InferenceNode(StoppableNode):
+    """A thin shell of ROS around :class:`physai.deploy.Controller`; the README lists its topics and services.
+
+    Raises:
+        UserError: If a parameter or the policy file is wrong.
+    """
+
+    def __init__(self) -> None:
+        super().__init__("inference_node")
+        self._started = time.monotonic()
+        self.config = config = declare(self, InferenceConfig, lambda changed: self._controller.configure(changed))
+        policy = _load(config)
+        self._controller = Controller(policy, config)
+        self._goal = _first_goal(config, policy)
+        self._joint_state: JointState | None = None
+        self._command = Command(None, State.WAITING, ())
+        self._enabled = config.autostart
+        self._publishing = False  # whether this node has a say in what the arm does
+        self._contested = False
+        self._late = 1.5 / config.rate_hz
+        self._timing = Timing()
+        joints = config.joints or policy.metadata.joints
+        self._index = [joints.index(joint) for joint in policy.metadata.joints]
+        self._velocity = [0.0] * len(joints)
+
+        self._commands = VelocityCommands(self, len(joints))
+        self._states = self.create_publisher(String, "~/state", qos.LATCHED)
+        self._estopped = self.create_publisher(Bool, "~/estopped", qos.LATCHED)
+        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
+        self.create_subscription(
+            JointStateMessage,
+            "/joint_states",
+            self._take_joint_state,  # type: ignore[arg-type]  # rclpy also takes callbacks with two arguments
+            qos.SENSOR,
+        )
+        self.create_subscription(PointStamped, "~/goal", self._take_goal, 1)
+        for profile in qos.EMERGENCY:
+            silent = SubscriptionEventCallbacks(incompatible_qos=lambda _: None, use_default_callbacks=False)
+            self.create_subscription(
+                Bool, "/emergency_stop", self._take_emergency_stop, profile, event_callbacks=silent
+            )
+        self.create_service(SetBool, "~/enable", self._enable)
+        self.create_service(Trigger, "~/estop", self._estop)
+        self.create_service(Trigger, "~/reset", self._reset)
+        self.create_service(Trigger, "~/shutdown", self._shutdown)
+        # Neither a paused simulation nor a change of the time of day stops these.
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self.create_timer(1.0 / config.rate_hz, self._on_timer, clock=steady)
+        self.create_timer(1.0, self._diagnose, clock=steady)
+        self._announce()
+        self.get_logger().info(
+            f"{config.policy_path} drives {list(policy.metadata.joints)} of '{policy.metadata.robot}', at most "
+            f"{config.max_velocity:g} rad/s; " + ("starting by itself" if self._enabled else "waiting for ~/enable")
+        )
+
+    # What comes in
+
+    def _take_joint_state(self, message: JointStateMessage, info: dict[str, int]) -> None:
+        # It may have waited for this thread: what counts is when it came to this computer.
+        arrived = info["received_timestamp"]
+        waited = max(0.0, (time.time_ns() - arrived) * 1e-9) if arrived else 0.0
+        stamp = message.header.stamp.sec + message.header.stamp.nanosec * 1e-9
+        received = time.monotonic() - waited
+        self._joint_state = JointState(message.name, message.position, message.velocity, stamp, received)
+        if self.config.trigger == "joint_state":
+            self._tick()
+
+    def _take_goal(self, message: PointStamped) -> None:
+        self._goal = Goal([message.point.x, message.point.y], message.header.frame_id)
+
+    def _take_emergency_stop(self, message: Bool) -> None:
+        if message.data:
+            self._emergency_stop("/emergency_stop")
+
+    def _enable(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
+        if not request.data:
+            self._enabled = False
+            self._tick()
+            response.success, response.message = True, "disabled: zero velocity"
+            return response
+        self._enabled = True
+        obstacles = self._interlocks(time.monotonic())
+        if self._command.state in (State.FAULT, State.ESTOP):
+            obstacles.append(f"{self._command.state.value}: call ~/reset first")
+        self._enabled = response.success = not obstacles
+        response.message = "; ".join(obstacles) or "enabled"
+        return response
+
+    def _estop(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        self._emergency_stop("~/estop")
+        response.success, response.message = True, "stopped until ~/reset"
+        return response
+
+    def _reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        latched = self._command.state in (State.FAULT, State.ESTOP)
+        self._goal = None
+        self._controller.reset()
+        self._tick()
+        response.success = True
+        response.message = "waiting for a new goal" if latched else "nothing to reset"
+        return response
+
+    def _shutdown(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        self.stopped = response.success = True
+        return response
+
+    def _emergency_stop(self, source: str) -> None:
+        if self._command.state is not State.ESTOP:
+            self.get_logger().error(f"emergency stop by {source}")
+        self._publishing = True
+        self._controller.emergency_stop()
+        self._tick()
+
+    # What goes out
+
+    def _on_timer(self) -> None:
+        if self.config.trigger == "timer" or time.monotonic() - self._timing.last > self._late:
+            self._tick()
+
+    def _tick(self) -> None:
+        now = time.monotonic()
+        self._timing.tick(now)
+        joint_state, self._joint_state = self._joint_state, None
+        goal, self._goal = self._goal, None
+        interlocks = self._interlocks(now)
+        command = self._controller.update(now, joint_state, goal, interlocks)
+        self._publish(command)
+        before, self._command = self._command, command
+        if goal is not None:
+            for reason in command.reasons:
+                if reason.startswith("goal"):
+                    self.get_logger().warning(reason)
+        if command.state is not before.state:
+            self._announce()
+
+    def _interlocks(self, now: float) -> list[str]:
+        """Why the arm must not move, beside what the controller knows."""
+        found = [] if self._enabled else ["not enabled"]
+        if now - self._started < _DISCOVERY:
+            return [*found, "looking for other nodes"]
+        rival = self._commands.rival
+        if rival is not None:
+            found.append(f"another publisher commands {self._commands.topic}: {rival}")
+            if not self._contested and self._command.state in (State.ACTIVE, State.REACHED):
+                # It will not go on by itself when the other one leaves.
+                self._controller.forget_goal()
+        self._contested = rival is not None
+        if not self._commands.heard:
+            found.append(f"no controller listens to {self._commands.topic}")
+        if self._enabled and not self._contested:
+            self._publishing = True
+        return found
+
+    def _publish(self, command: Command) -> None:
+        # A disabled node does not disturb another one, unless there is an emergency.
+        silent = self._contested and not self._enabled and command.state is not State.ESTOP
+        if command.velocity is None or silent or not self._publishing:
+            return
+        for index, velocity in zip(self._index, command.velocity.tolist(), strict=True):
+            self._velocity[index] = velocity
+        self._commands.send(self._velocity)
+
+    def _announce(self) -> None:
+        command = self._command
+        self._states.publish(String(data=command.state.value))
+        self._estopped.publish(Bool(data=command.state is State.ESTOP))
+        self._diagnose()
+        text = ": ".join([command.state.value, "; ".join(command.reasons)][: 2 if command.reasons else 1])
+        if command.state in (State.FAULT, State.ESTOP):
+            self.get_logger().error(text)
+        elif command.state is State.HOLD:
+            self.get_logger().warning(text)
+        else:
+            self.get_logger().info(text)
+
+    def _diagnose(self) -> None:
+        values = {**self._controller.snapshot(), **self._timing.summary(), "enabled": self._enabled}
+        now = self.get_clock().now().to_msg()
+        self._diagnostics.publish(diagnose(self.get_name(), now, self._controller.policy, values))
+
+    def finish(self) -> None:
+        """See that the last command that the robot got is zero."""
+        if self._publishing:
+            self._commands.finish()
+
+
+def _load(config: InferenceConfig) -> Policy:
+    if not config.policy_path:
+        raise UserError("policy_path: required, such as -p policy_path:=outputs/<run>/policy.pt")
+    policy = load_policy(config.policy_path, sha256=config.policy_sha256 or None)
+    metadata = policy.metadata
+    if config.joints and (
+        len(set(config.joints)) != len(config.joints) or not set(metadata.joints) <= set(config.joints)
+    ):
+        raise UserError(
+            f"joints: {list(config.joints)} must be distinct and hold all joints of the policy, {list(metadata.joints)}"
+        )
+    if config.rate_hz < metadata.control_rate:
+        raise UserError(
+            f"rate_hz: must be at least that of the policy, {metadata.control_rate:g}, got {config.rate_hz}"
+        )
+    return policy
+
+
+def _first_goal(config: InferenceConfig, policy: Policy) -> Goal | None:
+    if not config.goal:
+        return None
+    goal = Goal(list(config.goal), policy.metadata.goal_frame)
+    try:
+        accept(goal, policy.metadata, config.unreachable_goal == "project")
+    except GoalError as error:
+        raise UserError(f"goal: {error}") from None
+    return goal
+
+
+def main() -> int:
+    """Run the node."""
+    return run(InferenceNode, "physai.ros.inference_node", __doc__ or "", InferenceConfig)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,107 @@
+"""A PyBullet arm behind the topics of a ros2_control velocity controller: a real robot's place, without its dangers."""
+
+import sys
+import time
+from dataclasses import dataclass
+
+from rclpy.clock import Clock, ClockType
+from rclpy.time import Time
+from sensor_msgs.msg import JointState as JointStateMessage
+from std_msgs.msg import Float64MultiArray
+from std_srvs.srv import Trigger
+
+from physai.deploy import JointState
+from physai.deploy.parameters import parameter
+from physai.errors import UserError
+from physai.ros import qos
+from physai.ros.faults import FaultConfig, Faults
+from physai.ros.parameters import declare
+from physai.ros.run import StoppableNode, run
+from physai.ros.virtual_arm import VelocityController, VirtualArm
+
+
+@dataclass(frozen=True)
+class VirtualRobotConfig(FaultConfig):
+    """Parameters of the virtual robot."""
+
+    env: str = parameter("reacher", "a file of conf/env, which names the robot", fixed=True)
+    randomization: str = parameter("none", "a file of conf/randomization: its dynamics, delay and sensors", fixed=True)
+    seed: int = parameter(0, "draws one robot from the randomization", "", 0, 2**31 - 1, fixed=True)
+    rate_hz: float = parameter(100.0, "joint states per second, and physics steps", "Hz", 1.0, 1000.0, fixed=True)
+    joints: tuple[str, ...] = parameter((), "joints of the commands, in their order; empty: the robot's", fixed=True)
+    state_joints: tuple[str, ...] = parameter(
+        (), "joints in /joint_states, in their order; unknown ones stand still; empty: as joints", fixed=True
+    )
+    command_timeout: float = parameter(0.0, "a command is over after this; 0: it holds for ever", "s", 0.0, 60.0)
+
+
+class VirtualRobot(StoppableNode):
+    """Publishes /joint_states, and obeys /joint_velocity_controller/commands as the real controller does.
+
+    Raises:
+        UserError: If a parameter is wrong.
+    """
+
+    def __init__(self) -> None:
+        super().__init__("virtual_robot")
+        config = declare(self, VirtualRobotConfig, self._configure)
+        self._arm = VirtualArm(config.env, config.randomization, config.seed, 1.0 / config.rate_hz)
+        known = self._arm.spec.joints
+        joints = config.joints or known
+        if sorted(joints) != sorted(known):
+            raise UserError(f"joints: must be {list(known)} in some order, got {list(joints)}")
+        self._order = [joints.index(joint) for joint in known]
+        self._names = config.state_joints or joints
+        self._shown = [(i, known.index(joint)) for i, joint in enumerate(self._names) if joint in known]
+        self._controller = VelocityController(len(joints), config.command_timeout)
+        self._faults = Faults(config, config.seed)
+        self._states = self.create_publisher(JointStateMessage, "/joint_states", 10)
+        self.create_subscription(
+            Float64MultiArray, "/joint_velocity_controller/commands", self._take_command, qos.COMMAND
+        )
+        self.create_service(Trigger, "~/reset", self._reset)
+        self.create_timer(1.0 / config.rate_hz, self._step, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self.get_logger().info(f"'{self._arm.spec.name}' takes velocities of {list(joints)}")
+
+    def _configure(self, config: VirtualRobotConfig) -> None:
+        self._faults.config = config
+        self._controller.timeout = config.command_timeout
+
+    def _take_command(self, message: Float64MultiArray) -> None:
+        was = self._controller.active
+        self._controller.command(message.data, time.monotonic())
+        if was and not self._controller.active:
+            self.get_logger().error(
+                f"{len(message.data)} velocities for {len(self._order)} joints: inactive until ~/reset"
+            )
+
+    def _reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        self._controller.activate()
+        self._arm.reset()
+        response.success, response.message = True, "at home"
+        return response
+
+    def _step(self) -> None:
+        now = time.monotonic()
+        position, velocity = self._arm.step(self._controller.velocity(now)[self._order])
+        positions, velocities = [0.0] * len(self._names), [0.0] * len(self._names)
+        for place, joint in self._shown:
+            positions[place], velocities[place] = float(position[joint]), float(velocity[joint])
+        stamp = self.get_clock().now().nanoseconds
+        for state in self._faults.apply(JointState(self._names, positions, velocities, stamp), now):
+            message = JointStateMessage(name=state.names, position=state.position, velocity=state.velocity)
+            message.header.stamp = Time(nanoseconds=int(state.stamp)).to_msg()
+            self._states.publish(message)
+
+    def finish(self) -> None:
+        """Free the physics engine."""
+        self._arm.close()
+
+
+def main() -> int:
+    """Run the node."""
+    return run(VirtualRobot, "physai.ros.virtual_robot", __doc__ or "", VirtualRobotConfig)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,62 @@
+"""Real ROS 2 for tests: loopback only, a domain for each test, and nothing left behind."""
+
+import os
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"  # before anything of ROS starts
+
+from physai.ros.run import prepare_middleware
+
+prepare_middleware()
+
+from tests.ros.peer import SHM, Peer, Process, free_domain, node_command, remove_dead_segments
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _no_shared_memory_left() -> Iterator[None]:
+    """Nodes that are killed, as many here are, leave segments behind; LTTng leaves its own after everyone."""
+    traced = set(SHM.glob("lttng-ust-wait*"))
+    yield
+    remove_dead_segments()
+    for path in set(SHM.glob("lttng-ust-wait*")) - traced:
+        path.unlink(missing_ok=True)
+
+
+@pytest.fixture
+def domain() -> Iterator[int]:
+    """A ROS domain of this test's own."""
+    with free_domain() as found:
+        yield found
+
+
+@pytest.fixture
+def start(domain: int) -> Iterator[Callable[..., Process]]:
+    """Start nodes of physai: ``start("virtual_robot", rate_hz=100)``; they are gone after the test."""
+    processes: list[Process] = []
+
+    def start(module: str, *args: str, env: dict[str, str] | None = None, **parameters: Any) -> Process:
+        processes.append(Process(node_command(module, *args, **parameters), domain, env))
+        return processes[-1]
+
+    start.run = lambda command, env=None: processes.append(Process(command, domain, env)) or processes[-1]
+    yield start
+    with ThreadPoolExecutor() as pool:
+        list(pool.map(Process.end, processes))
+
+
+@pytest.fixture
+def peer(domain: int) -> Iterator[Peer]:
+    """A node in this process that listens to everything."""
+    made = Peer(domain)
+    yield made
+    made.close()
+
+
+@pytest.fixture
+def policy_path(exported_run: Path) -> Path:
+    return exported_run / "policy.pt"

@@ -1,0 +1,246 @@
+"""The other side of the nodes under test: real processes, and a node of ours that sends, listens and remembers."""
+
+import contextlib
+import ctypes
+import fcntl
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import rclpy
+from geometry_msgs.msg import PointStamped
+from rclpy.context import Context
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.qos import QoSProfile
+from rclpy.signals import SignalHandlerOptions
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Bool, Float64MultiArray, String
+from std_srvs.srv import SetBool, Trigger
+
+from physai.ros import qos
+from physai.ros.commands import TOPIC
+
+SHM = Path("/dev/shm")
+_PR_SET_PDEATHSIG = 1
+_LIBC = ctypes.CDLL(None)
+
+
+def wait_for(condition: Callable[[], Any], timeout: float = 20.0, what: str = "") -> Any:
+    """Return what the condition returns as soon as it is true."""
+    end = time.monotonic() + timeout
+    while not (result := condition()):
+        assert time.monotonic() < end, f"waited {timeout} s in vain: {what or condition}"
+        time.sleep(0.002)
+    return result
+
+
+class Process:
+    """A node in a process of its own, which dies with this one; its output is read as it comes."""
+
+    def __init__(self, command: Sequence[str], domain: int, env: dict[str, str] | None = None) -> None:
+        self.command = list(command)
+        self.lines: list[str] = []
+        self._popen = subprocess.Popen(
+            self.command,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            env={**os.environ, "ROS_DOMAIN_ID": str(domain), "PYTHONUNBUFFERED": "1", **(env or {})},
+            preexec_fn=lambda: _LIBC.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL),
+            start_new_session=True,
+        )
+        self._reader = threading.Thread(target=self._read, daemon=True)
+        self._reader.start()
+
+    def _read(self) -> None:
+        assert self._popen.stdout is not None
+        for line in self._popen.stdout:
+            self.lines.append(line.rstrip())
+
+    @property
+    def output(self) -> str:
+        return "\n".join(self.lines)
+
+    @property
+    def pid(self) -> int:
+        return self._popen.pid
+
+    def says(self, text: str, timeout: float = 20.0) -> str:
+        """Wait for a line with this text, and return it."""
+
+        def found() -> str | None:
+            return next((line for line in self.lines if text in line), None)
+
+        wait_for(lambda: found() or self._popen.poll() is not None, timeout, f"{text!r} in:\n{self.output}")
+        self._reader.join(0.0 if self._popen.poll() is None else 2.0)
+        line = found()
+        assert line is not None, f"ended with {self._popen.poll()} without {text!r}:\n{self.output}"
+        return line
+
+    def signal(self, number: int) -> None:
+        self._popen.send_signal(number)
+
+    def wait(self, timeout: float = 20.0) -> int:
+        """Wait for its end, and return its exit code."""
+        code = self._popen.wait(timeout)
+        self._reader.join(2.0)
+        return code
+
+    def end(self) -> None:
+        """Make sure that it is gone: politely, so that it tidies up, and then not."""
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(self._popen.pid, signal.SIGCONT)
+            os.killpg(self._popen.pid, signal.SIGTERM)
+        try:
+            self._popen.wait(5)
+        except subprocess.TimeoutExpired:
+            os.killpg(self._popen.pid, signal.SIGKILL)
+            self._popen.wait(10)
+        self._reader.join(2.0)
+
+
+def node_command(module: str, *args: str, **parameters: Any) -> list[str]:
+    """Command line of a node: parameters by name, everything else as it stands after --ros-args."""
+    command = [sys.executable, "-m", f"physai.ros.{module}", "--ros-args"]
+    for name, value in parameters.items():
+        text = str(value).lower() if isinstance(value, bool) else str(value)
+        command += ["-p", f"{name}:={text}"]
+    return command + list(args)
+
+
+class Peer:
+    """A node in this process that remembers what it hears, each with the time at which it came.
+
+    Attributes:
+        commands: (time, velocities) of every command on the controller's topic.
+        states: (time, text) of the inference node's ``~/state``.
+        joint_states: (time, message).
+    """
+
+    def __init__(self, domain: int, listen_to_commands: bool = True) -> None:
+        self._context = Context()
+        rclpy.init(context=self._context, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
+        self.node = Node("peer", context=self._context)
+        self.commands: list[tuple[float, list[float]]] = []
+        self.states: list[tuple[float, str]] = []
+        self.joint_states: list[tuple[float, JointState]] = []
+        if listen_to_commands:
+            # Deep, so that no command is missed; a controller would only look at the last.
+            self.listen(Float64MultiArray, TOPIC, self.commands, 1000, lambda message: message.data.tolist())
+        self.listen(String, "/inference_node/state", self.states, qos.LATCHED, lambda message: message.data)
+        self.listen(JointState, "/joint_states", self.joint_states, 10)
+        self._publishers: dict[tuple[Any, ...], Any] = {}
+        self._executor = SingleThreadedExecutor(context=self._context)
+        self._executor.add_node(self.node)
+        self._thread = threading.Thread(target=self._spin, daemon=True)
+        self._thread.start()
+
+    def _spin(self) -> None:
+        with contextlib.suppress(ExternalShutdownException):
+            self._executor.spin()
+
+    def listen(
+        self,
+        kind: type,
+        topic: str,
+        into: list[Any],
+        profile: QoSProfile | int,
+        read: Callable[[Any], Any] = lambda message: message,
+    ) -> None:
+        """Append (time, what ``read`` makes of the message) for every message."""
+        self.node.create_subscription(
+            kind, topic, lambda message: into.append((time.monotonic(), read(message))), profile
+        )
+
+    def publisher(self, kind: type, topic: str, profile: QoSProfile | int = 10) -> Any:
+        key = (kind, topic, str(profile))
+        if key not in self._publishers:
+            self._publishers[key] = self.node.create_publisher(kind, topic, profile)
+        return self._publishers[key]
+
+    def publish(self, topic: str, message: Any, profile: QoSProfile | int = 10) -> None:
+        """Publish once somebody listens."""
+        publisher = self.publisher(type(message), topic, profile)
+        wait_for(publisher.get_subscription_count, what=f"a listener to {topic}")
+        publisher.publish(message)
+
+    def send_goal(self, x: float, y: float, frame: str = "base") -> None:
+        message = PointStamped()
+        message.header.frame_id = frame
+        message.point.x, message.point.y = x, y
+        self.publish("/inference_node/goal", message)
+
+    def emergency_stop(self, pressed: bool = True) -> None:
+        self.publish("/emergency_stop", Bool(data=pressed))
+
+    def call(self, service: str, request: Any = None) -> Any:
+        """Call a service, std_srvs/Trigger unless a request says otherwise, and return its answer."""
+        request = request or Trigger.Request()
+        kind = SetBool if isinstance(request, SetBool.Request) else Trigger
+        return self.call_service(kind, service, request)
+
+    def call_service(self, kind: type, service: str, request: Any, timeout: float = 20.0) -> Any:
+        client = self.node.create_client(kind, service)
+        try:
+            wait_for(client.service_is_ready, timeout, f"service {service}")
+            future = client.call_async(request)
+            wait_for(future.done, timeout, f"answer of {service}")
+            return future.result()
+        finally:
+            self.node.destroy_client(client)
+
+    def wait_state(self, *names: str, timeout: float = 30.0, after: float = 0.0) -> tuple[float, str]:
+        """Wait until the node's last announced state is one of these (announced after a time, if given)."""
+
+        def there() -> tuple[float, str] | None:
+            last = self.states[-1] if self.states else None
+            return last if last and last[1] in names and last[0] >= after else None
+
+        return wait_for(there, timeout, f"state {names}; had {self.states[-5:]}")
+
+    def close(self) -> None:
+        self._executor.shutdown()
+        self._context.try_shutdown()
+        self._thread.join(5.0)
+        self.node.destroy_node()
+
+
+@contextlib.contextmanager
+def free_domain() -> Iterator[int]:
+    """A domain id that no other test on this machine uses now."""
+    for domain in range(1, 100):
+        with open(f"/tmp/physai-test-domain-{domain}.lock", "w") as lock:
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                continue
+            yield domain
+            return
+    raise RuntimeError("all domains are taken")
+
+
+def remove_dead_segments() -> list[str]:
+    """Remove Fast DDS' shared memory of processes that were killed; the living hold a lock on theirs."""
+    removed = []
+    for segment in SHM.glob("fastrtps_*[0-9a-f]"):
+        lock = segment.with_name(f"{segment.name}_el")
+        try:
+            with open(lock) as file:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            dead = True
+        except BlockingIOError:
+            dead = False
+        except FileNotFoundError:  # a killed process's, or one so new that it has no lock yet
+            dead = segment.exists() and time.time() - segment.stat().st_mtime > 5.0
+        for path in (lock, segment, SHM / f"sem.{segment.name}_mutex") if dead else ():
+            with contextlib.suppress(FileNotFoundError):
+                path.unlink()
+                removed.append(path.name)
+    return removed

@@ -1,0 +1,12 @@
+"""The inference node and the virtual robot, each in its own process."""
+
+
+def test_the_arm_reaches_goal_after_goal(start, peer, policy_path):
+    start("virtual_robot")
+    start("inference_node", policy_path=policy_path, autostart=True, max_velocity=1.0, limit_margin=0.2)
+    for x, y in [(0.1, 0.4), (-0.3, -0.2), (0.4, 0.0)]:
+        peer.wait_state("waiting", "reached")
+        peer.send_goal(x, y)
+        since, _ = peer.wait_state("active")
+        peer.wait_state("reached", after=since)
+    assert max(abs(v) for _, command in peer.commands for v in command) <= 1.0 + 1e-9
