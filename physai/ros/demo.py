@@ -1,0 +1,110 @@
+"""``python -m physai.ros.demo``: an exported policy drives the virtual robot over ROS 2 (see ``--help``)."""
+
+import os
+import sys
+import tempfile
+from contextlib import ExitStack
+from pathlib import Path
+
+import numpy as np
+from omegaconf import DictConfig
+from rich.console import Console
+
+from physai import cli
+from physai.config import Config, Count, PositiveFloat, Seed, compose, validate
+from physai.deploy import Metadata, load_policy, read_metadata
+from physai.errors import UserError
+
+
+class DemoConfig(Config):
+    """``conf/demo.yaml``."""
+
+    policy_path: str | None
+    goals: Count
+    hold: PositiveFloat
+    max_velocity: PositiveFloat
+    randomization: str
+    seed: Seed
+    output: str | None
+
+    def path(self) -> Path:
+        """The policy file.
+
+        Raises:
+            UserError: If there is none.
+        """
+        if self.policy_path is not None:
+            return Path(self.policy_path)
+        found = sorted(Path("outputs").glob("**/policy.pt"), key=lambda path: path.stat().st_mtime)
+        if not found:
+            raise UserError(
+                "no policy.pt in outputs/: train one (python -m physai.train), or name one with policy_path=..."
+            )
+        return found[-1]
+
+
+def sample_goals(metadata: Metadata, count: int, seed: int) -> np.ndarray:
+    """Draw goals [count, 2], m, on the ring that the policy was trained on."""
+    draw = np.random.default_rng(seed).random((2, count))
+    inner, outer = metadata.goal_radius
+    radius, angle = inner + (outer - inner) * draw[0], 2 * np.pi * draw[1]
+    return np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
+
+
+def _check(node: DictConfig) -> None:
+    config = validate(DemoConfig, node)
+    metadata = read_metadata(config.path())
+    compose("train", [f"randomization={config.randomization}"])
+    if config.max_velocity > metadata.velocity_limit.min():
+        raise UserError(f"max_velocity: the robot's limit is {metadata.velocity_limit.min():g} rad/s")
+
+
+def _demo(node: DictConfig, _: Path) -> None:
+    os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"  # no robot but ours shall hear of this
+    from physai.ros.picture import draw_tour
+    from physai.ros.processes import NodeProcess
+    from physai.ros.tour import Tourist
+
+    config = validate(DemoConfig, node)
+    path = config.path()
+    policy = load_policy(path)
+    console = Console()
+    console.print(f"{path} drives a virtual {policy.metadata.robot} (randomization={config.randomization})")
+    with ExitStack() as stack:
+        logs = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="physai-demo-")))
+        tourist = stack.enter_context(Tourist(policy))
+        tourist.check_alone()
+        env = policy.metadata.raw["config"]["env"]["name"]
+        robot = NodeProcess(
+            "virtual_robot", logs / "robot", env=env, randomization=config.randomization, seed=config.seed
+        )
+        inference = NodeProcess(
+            "inference_node",
+            logs / "inference",
+            policy_path=path,
+            autostart=True,
+            max_velocity=config.max_velocity,
+            limit_margin=max(0.1, round(0.161 * config.max_velocity, 3)),
+        )
+        for process in (robot, inference):
+            stack.enter_context(process)
+        tourist.watch = (robot, inference)
+        tourist.wait_until_ready()
+        console.print("virtual_robot and inference_node work; sending goals")
+        goals = sample_goals(policy.metadata, config.goals, config.seed)
+        for number, goal in enumerate(goals, 1):
+            visit = tourist.visit(goal, config.hold)
+            console.print(f"  {number:>3}  {visit.describe()}", highlight=False)
+    output = Path(config.output) if config.output else path.with_name("demo.png")
+    try:
+        draw_tour(tourist.tour, policy.metadata, output)
+    except (OSError, ValueError) as error:
+        raise UserError(f"cannot write {output}: {error}") from None
+    kept = sum(visit.kept for visit in tourist.tour.visits)
+    console.print(f"{kept} of {len(goals)} goals reached, and held for {config.hold:g} s. The path: {output}")
+    if kept < len(goals):
+        sys.exit(1)
+
+
+if __name__ == "__main__":
+    cli.main("demo", _demo, _check)

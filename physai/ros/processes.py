@@ -1,0 +1,61 @@
+"""Nodes in processes of their own that end when this program does, however that ends."""
+
+import contextlib
+import ctypes
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from types import TracebackType
+
+_PR_SET_PDEATHSIG = 1  # Linux: prctl(2)
+_PATIENCE = 5.0  # s
+
+
+class NodeProcess:
+    """A node of physai; as a context manager it ends with the block, by SIGTERM, so that it leaves the arm standing.
+
+    Args:
+        module: Such as ``virtual_robot``.
+        log: Where its output goes.
+        parameters: ROS parameters by name.
+    """
+
+    def __init__(self, module: str, log: Path, **parameters: object) -> None:
+        self.module = module
+        self.log = log
+        command = [sys.executable, "-m", f"physai.ros.{module}", "--ros-args"]
+        for name, value in parameters.items():
+            command += ["-p", f"{name}:={str(value).lower() if isinstance(value, bool) else value}"]
+        with open(log, "w") as output:
+            self._process = subprocess.Popen(
+                command, stdout=output, stderr=subprocess.STDOUT, preexec_fn=_die_with_parent, env=None
+            )
+        self.pid = self._process.pid
+
+    @property
+    def ended(self) -> bool:
+        """Whether it has ended."""
+        return self._process.poll() is not None
+
+    def last_words(self) -> str:
+        """The last line of its output."""
+        lines = [line for line in self.log.read_text(errors="replace").splitlines() if line.strip()]
+        return lines[-1] if lines else "no output"
+
+    def __enter__(self) -> "NodeProcess":
+        return self
+
+    def __exit__(self, kind: type | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        with contextlib.suppress(ProcessLookupError):
+            self._process.terminate()
+        try:
+            self._process.wait(_PATIENCE)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+
+
+def _die_with_parent() -> None:
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
