@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 ARGS ?=
 
-.PHONY: help train test bench check format build clean
+.PHONY: help train demo test bench check format build clean
 help:  ## Show this help
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## (.*)/  make \1\t\2/'
 
@@ -20,6 +20,11 @@ $(VENV)/.installed: pyproject.toml constraints.txt | $(BIN)/python
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[onnx]'
 	@touch $@
 
+$(VENV)/.installed-ros: $(VENV)/.installed
+	@echo "==> Installing ROS 2 Jazzy into $(VENV)"
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[onnx,ros]'
+	@touch $@
+
 $(VENV)/.installed-dev: $(VENV)/.installed
 	@echo "==> Installing the tools for tests and benchmarks into $(VENV)"
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev,bench,onnx,ros]'
@@ -29,11 +34,15 @@ train: $(VENV)/.installed  ## Train the two-link arm (ARGS="env=kuka_reacher see
 	@echo "==> Training"
 	$(BIN)/python -m physai.train env=reacher $(ARGS)
 
+demo: $(VENV)/.installed-ros  ## Let the newest policy drive a virtual robot over ROS 2 (ARGS="randomization=strong")
+	@echo "==> Driving"
+	$(BIN)/python -m physai.ros.demo $(ARGS)
+
 test: $(VENV)/.installed-dev  ## Run all tests (ARGS="-m 'not slow'" for the quick ones)
 	@echo "==> Testing"
 	$(BIN)/python -m pytest -n 2 --dist worksteal $(ARGS)
 
-bench: $(VENV)/.installed-dev  ## Measure speed against bare PyBullet and Stable-Baselines3
+bench: $(VENV)/.installed-dev  ## Measure speed against bare PyBullet, rclpy and Stable-Baselines3
 	@echo "==> Measuring (takes minutes)"
 	$(BIN)/python -m physai.bench $(ARGS)
 

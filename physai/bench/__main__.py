@@ -1,4 +1,4 @@
-"""``python -m physai.bench``: physai against bare PyBullet, Stable-Baselines3 and TorchRL's actor (see ``--help``)."""
+"""``python -m physai.bench``: physai against what it stands on, and Stable-Baselines3 (see ``--help``)."""
 
 import argparse
 from importlib.util import find_spec
@@ -17,16 +17,22 @@ from physai.errors import UserError
 def main() -> None:
     """Measure, then show the figures as tables."""
     options = _options()
-    everything = not (options.collect or options.train or options.policy)
+    everything = not (options.collect or options.train or options.policy or options.ros)
     with cli.guard():
         if (everything or options.train) and find_spec("stable_baselines3") is None:
             raise UserError("no stable_baselines3 here: pip install 'physai[bench]', or use --collect or --policy")
         if (everything or options.policy) and onnx.missing():
             raise UserError(f"no {onnx.missing()[0]} here: pip install 'physai[onnx]', or use --collect or --train")
+        if (everything or options.ros) and find_spec("rclpy") is None:
+            raise UserError("no rclpy here: pip install 'physai[ros]', or use --policy, --collect or --train")
         print(machine(), flush=True)
         tables = []
         if everything or options.policy:
             tables.append(policy_table(*measure_policy(options.seed)))
+        if everything or options.ros:
+            from physai.bench.ros import measure_ros, ros_table  # ROS reads its environment when it is imported
+
+            tables.append(ros_table(measure_ros(options.seed)))
         if everything or options.collect:
             tables.append(collection_table(*measure_collection(options.seed)))
         if everything or options.train:
@@ -38,12 +44,13 @@ def _options() -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         prog="python -m physai.bench",
         description="Measure physai on the two-link arm: how long an exported policy takes for a command, against "
-        "TorchRL's actor; how fast it collects, against a bare PyBullet loop; and how soon its policy reaches 99 % of "
-        "1,000 unseen goals, against Stable-Baselines3 PPO.",
+        "TorchRL's actor; how well the ROS 2 node keeps its 50 Hz, beside a bare one; how fast it collects, against a "
+        "bare PyBullet loop; and how soon its policy reaches 99 % of unseen goals, against Stable-Baselines3 PPO.",
         formatter_class=argparse.ArgumentDefaultsHelpFormatter,
     )
     part = parser.add_mutually_exclusive_group()
     part.add_argument("--policy", action="store_true", help="measure the exported policy only")
+    part.add_argument("--ros", action="store_true", help="measure the ROS 2 node only")
     part.add_argument("--collect", action="store_true", help="measure collection only")
     part.add_argument("--train", action="store_true", help="measure training only")
     parser.add_argument("--seed", type=int, default=0, help="seed of all sides")

@@ -36,16 +36,9 @@ Call = Callable[[], Any]
 
 def measure_policy(seed: int) -> tuple[dict[str, np.ndarray], float]:
     """Return the times of single calls by form, s, and the median time to load a policy file, s."""
-    config = reacher(seed, f"total_frames={FRAMES}", "evaluation.episodes=100")
-    torch.set_num_threads(config.threads)
     with tempfile.TemporaryDirectory() as folder:
         run = Path(folder)
-        (run / ".hydra").mkdir()
-        (run / ".hydra" / "config.yaml").write_text(OmegaConf.to_yaml(config.model_dump(mode="json")))
-        print(f"Exporting a policy that has seen {FRAMES:,} frames; how good it is does not matter ...", flush=True)
-        with contextlib.redirect_stdout(io.StringIO()):
-            run_training(config, run)
-        export_policy(run, "best", list(FILES), episodes=10)
+        make_run(run, seed, list(FILES))
         loads = [_seconds(lambda: load_policy(run / FILES["torchscript"])) for _ in range(LOADS)]
         forms = _forms(run)
         times: dict[str, list[list[float]]] = {name: [] for name in forms}
@@ -54,6 +47,18 @@ def measure_policy(seed: int) -> tuple[dict[str, np.ndarray], float]:
                 for name, call in forms.items():
                     times[name].append([_seconds(call) for _ in range(CALLS)])
     return {name: np.concatenate(rounds[1:]) for name, rounds in times.items()}, statistics.median(loads)
+
+
+def make_run(run: Path, seed: int, formats: list[str]) -> None:
+    """Train a little, and export the policy in these formats; how good it is does not matter here."""
+    config = reacher(seed, f"total_frames={FRAMES}", "evaluation.episodes=100")
+    torch.set_num_threads(config.threads)
+    (run / ".hydra").mkdir()
+    (run / ".hydra" / "config.yaml").write_text(OmegaConf.to_yaml(config.model_dump(mode="json")))
+    print(f"Exporting a policy that has seen {FRAMES:,} frames; how good it is does not matter ...", flush=True)
+    with contextlib.redirect_stdout(io.StringIO()):
+        run_training(config, run)
+    export_policy(run, "best", formats, episodes=10)
 
 
 def _forms(run: Path) -> dict[str, Call]:

@@ -104,7 +104,7 @@ class Controller:
         self.config = config
         self._reader.configure(config)
         self._limits = VelocityLimits(self.policy.metadata, config)
-        # A lower velocity holds at once, whatever the acceleration limit: the margin may be too narrow for a higher one.
+        # A lower velocity holds at once, whatever the acceleration limit: the margin may be too narrow for another.
         self._last = self._last * min(1.0, config.max_velocity / max(np.abs(self._last).max(), 1e-9))
 
     def update(

@@ -5,6 +5,7 @@ import sys
 import tempfile
 from contextlib import ExitStack
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from omegaconf import DictConfig
@@ -23,9 +24,14 @@ class DemoConfig(Config):
     goals: Count
     hold: PositiveFloat
     max_velocity: PositiveFloat
-    randomization: str
+    randomization: dict[str, Any]
     seed: Seed
     output: str | None
+
+    @property
+    def robot(self) -> str:
+        """File of ``conf/randomization`` that the robot is drawn from."""
+        return str(self.randomization["name"])
 
     def path(self) -> Path:
         """The policy file.
@@ -54,7 +60,8 @@ def sample_goals(metadata: Metadata, count: int, seed: int) -> np.ndarray:
 def _check(node: DictConfig) -> None:
     config = validate(DemoConfig, node)
     metadata = read_metadata(config.path())
-    compose("train", [f"randomization={config.randomization}"])
+    if node.randomization != compose("train", [f"randomization={config.robot}"]).randomization:
+        raise UserError("randomization: the virtual robot takes a file of conf/randomization as it is")
     if config.max_velocity > metadata.velocity_limit.min():
         raise UserError(f"max_velocity: the robot's limit is {metadata.velocity_limit.min():g} rad/s")
 
@@ -69,17 +76,17 @@ def _demo(node: DictConfig, _: Path) -> None:
     path = config.path()
     policy = load_policy(path)
     console = Console()
-    console.print(f"{path} drives a virtual {policy.metadata.robot} (randomization={config.randomization})")
+    console.print(f"{path} drives a virtual {policy.metadata.robot} (randomization={config.robot})")
     with ExitStack() as stack:
         logs = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="physai-demo-")))
         tourist = stack.enter_context(Tourist(policy))
         tourist.check_alone()
         env = policy.metadata.raw["config"]["env"]["name"]
         robot = NodeProcess(
-            "virtual_robot", logs / "robot", env=env, randomization=config.randomization, seed=config.seed
+            "physai.ros.virtual_robot", logs / "robot", env=env, randomization=config.robot, seed=config.seed
         )
         inference = NodeProcess(
-            "inference_node",
+            "physai.ros.inference_node",
             logs / "inference",
             policy_path=path,
             autostart=True,

@@ -16,7 +16,7 @@ class NodeProcess:
     """A node of physai; as a context manager it ends with the block, by SIGTERM, so that it leaves the arm standing.
 
     Args:
-        module: Such as ``virtual_robot``.
+        module: Such as ``physai.ros.virtual_robot``.
         log: Where its output goes.
         parameters: ROS parameters by name.
     """
@@ -24,12 +24,12 @@ class NodeProcess:
     def __init__(self, module: str, log: Path, **parameters: object) -> None:
         self.module = module
         self.log = log
-        command = [sys.executable, "-m", f"physai.ros.{module}", "--ros-args"]
+        command = [sys.executable, "-m", module, "--ros-args"]
         for name, value in parameters.items():
             command += ["-p", f"{name}:={str(value).lower() if isinstance(value, bool) else value}"]
         with open(log, "w") as output:
             self._process = subprocess.Popen(
-                command, stdout=output, stderr=subprocess.STDOUT, preexec_fn=_die_with_parent, env=None
+                command, stdout=output, stderr=subprocess.STDOUT, preexec_fn=_die_with_parent
             )
         self.pid = self._process.pid
 

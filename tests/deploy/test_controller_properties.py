@@ -585,7 +585,7 @@ LENGTHS = {
     "policy pushes outward": 300,
     "policy shakes": 100,
     "policy to and fro at a limit": 300,
-    "counted to half a turn": 60,
+    "counted to half a turn": 120,
     "arm in a margin": 50,
     "arm beyond a limit": 100,
     "reset": 1,

@@ -212,7 +212,9 @@ def test_whatever_is_given_is_taken_as_its_type_or_refused_in_one_line_that_name
         for name, field in OTHERS.items():
             value = getattr(taken, name)
             assert type(value) is type(field.default)
-            assert value == (tuple(values[name]) if isinstance(values.get(name), list) else values.get(name, field.default))
+            assert value == (
+                tuple(values[name]) if isinstance(values.get(name), list) else values.get(name, field.default)
+            )
 
 
 # What the controller refuses, since it does not fit its robot: of 2.5 rad/s, a joint of 2.6 rad, at 50 Hz.

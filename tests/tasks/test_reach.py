@@ -147,7 +147,9 @@ def test_observations_have_finite_bounds_that_hold_after_many_turns(task, reache
     assert torch.isfinite(lower).all()
     assert torch.isfinite(upper).all()
     q = torch.stack([torch.linspace(-1000, 1000, 5000), torch.linspace(-2.6, 2.6, 5000)], dim=1)
-    observation, _ = task.observation(spec, kinematics)(q, torch.zeros_like(q), task.sample_goal(5000, torch.Generator()))
+    observation, _ = task.observation(spec, kinematics)(
+        q, torch.zeros_like(q), task.sample_goal(5000, torch.Generator())
+    )
     assert ((lower <= observation) & (observation <= upper)).all()
     assert spec.position_limit[0].tolist() == [-math.inf, math.inf]  # what it says of the robot is left alone
 

@@ -1,0 +1,30 @@
+"""The measurement of the ROS 2 node runs, and shows every figure."""
+
+import pytest
+from rich.console import Console
+
+from physai.bench import policy, ros
+from tests.ros.peer import free_domain
+
+
+@pytest.mark.slow
+def test_both_nodes_are_timed_and_shown(monkeypatch):
+    monkeypatch.setattr(policy, "FRAMES", 4096)
+    monkeypatch.setattr(ros, "PERIOD_SECONDS", 2.0)
+    monkeypatch.setattr(ros, "LATENCY_SECONDS", 1.0)
+    monkeypatch.setattr(ros, "STARTS", 1)
+    with free_domain() as domain:
+        monkeypatch.setenv("ROS_DOMAIN_ID", str(domain))
+        figures = ros.measure_ros(seed=0)
+    for node in figures.values():
+        assert 80 < len(node.periods) < 120
+        assert node.periods.mean() == pytest.approx(0.02, rel=0.05)
+        assert 60 < len(node.latencies) < 110
+        assert (node.latencies > 0).all()
+        assert 0 < node.cpu < 1
+        assert len(node.starts) == 1
+    console = Console(width=120, record=True)
+    console.print(ros.ros_table(figures))
+    shown = console.export_text()
+    for part in ("p99", "ms", "load of a core", "start to first message"):
+        assert part in shown

@@ -1,0 +1,83 @@
+"""The demo: both nodes, goal after goal, and a picture."""
+
+import os
+import signal
+import sys
+from pathlib import Path
+
+import imageio.v3 as imageio
+import numpy as np
+import pytest
+
+from physai.deploy import read_metadata
+from physai.ros.demo import sample_goals
+from tests.ros.peer import Process, wait_for
+
+
+def demo(*overrides: str) -> list[str]:
+    return [sys.executable, "-m", "physai.ros.demo", *overrides]
+
+
+def children(pid: int) -> list[int]:
+    return [int(child) for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
+
+
+def alive(pid: int) -> bool:
+    status = Path(f"/proc/{pid}/status")
+    return status.exists() and "\nState:\tZ" not in status.read_text()
+
+
+@pytest.mark.slow
+def test_ten_goals_are_reached_and_held_for_three_seconds_and_the_path_is_drawn(start, policy_path, tmp_path):
+    picture = tmp_path / "path.png"
+    process = start.run(demo(f"policy_path={policy_path}", f"output={picture}"))
+    assert process.wait(240) == 0, process.output
+    assert "10 of 10 goals reached, and held for 3 s" in process.output
+    image = imageio.imread(picture)
+    assert image.shape[0] > 400
+    assert image.std() > 10
+
+
+def test_it_refuses_to_start_where_a_robot_is_already(start, policy_path):
+    start("virtual_robot").says("takes velocities")
+    process = start.run(demo(f"policy_path={policy_path}"))
+    assert process.wait(60) == 2
+    assert process.lines[-1].startswith("error: another node uses /joint")
+    assert "ROS_DOMAIN_ID" in process.lines[-1]
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
+def test_its_nodes_end_with_it_however_it_ends(start, policy_path, number, tmp_path):
+    process: Process = start.run(demo(f"policy_path={policy_path}", f"output={tmp_path / 'path.png'}"))
+    process.says("sending goals", 60)
+    nodes = children(process.pid)
+    assert len(nodes) == 2
+    os.kill(process.pid, number)
+    process.wait()
+    wait_for(lambda: not any(map(alive, nodes)), 10, "the nodes' end")
+
+
+@pytest.mark.parametrize(
+    ("override", "line"),
+    [
+        ("policy_path=/nowhere/policy.pt", "error: /nowhere/policy.pt: no such file"),
+        ("goals=0", "error: goals: "),
+        ("max_velocity=9", "error: max_velocity: the robot's limit is 2.5 rad/s"),
+        ("randomization=stong", "error: randomization/stong: no such config; did you mean 'strong'?"),
+        ("gaols=3", "error: unknown key 'gaols'; did you mean 'goals'?"),
+    ],
+)
+def test_bad_input_is_refused_in_one_line(start, policy_path, override, line):
+    path = [] if override.startswith("policy_path") else [f"policy_path={policy_path}"]
+    process = start.run(demo(*path, override))
+    assert process.wait(60) == 2
+    assert process.lines[-1].startswith(line)
+
+
+def test_goals_lie_on_the_ring_that_the_policy_was_trained_on(policy_path):
+    metadata = read_metadata(policy_path)
+    goals = sample_goals(metadata, 500, seed=0)
+    radius = np.linalg.norm(goals, axis=1)
+    inner, outer = metadata.goal_radius
+    assert inner <= radius.min() < radius.max() <= outer
+    assert not np.array_equal(goals, sample_goals(metadata, 500, seed=1))
