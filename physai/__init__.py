@@ -1,7 +1,7 @@
 """physai: the shortest trustworthy way from a simulated robot arm to a policy on a ROS 2 robot.
 
-Importing it registers ``physai/Reacher-v0`` and ``physai/KukaReacher-v0`` with Gymnasium, where that is installed, and
-imports nothing heavy.
+Importing it registers ``physai/Reacher-v0``, ``physai/KukaReacher-v0`` and, for a robot behind ROS topics,
+``physai/RosReacher-v0`` with Gymnasium, where that is installed, and imports nothing heavy.
 """
 
 import importlib.util
@@ -35,6 +35,8 @@ def _register() -> None:
             vector_entry_point="physai.envs.gym_env:RobotVectorEnv",
             kwargs={"env": env},
         )
+    # What moves in real time never moves twice in exactly the same way.
+    register("physai/RosReacher-v0", entry_point="physai.ros:RosReacherEnv", nondeterministic=True)
 
 
 if importlib.util.find_spec("gymnasium") is not None:  # a robot that only runs policies may not have it

@@ -3,6 +3,7 @@
 import contextlib
 import itertools
 import os
+import signal
 import sys
 import traceback
 from collections.abc import Callable, Iterator
@@ -43,12 +44,16 @@ def overrides() -> list[str]:
 
 
 class guard:  # noqa: N801
-    """Context in which what a user or a disk does wrong ends in one line and exit code 2, and Ctrl-C in 130."""
+    """Context in which what a user or a disk does wrong ends in one line and exit code 2, and Ctrl-C in 130.
+
+    SIGTERM ends it like Ctrl-C, so that a robot is not left moving.
+    """
 
     def __enter__(self) -> None:
-        pass
+        self._before = signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
 
     def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
+        signal.signal(signal.SIGTERM, self._before)
         if isinstance(error, UserError):
             print(f"error: {error}", file=sys.stderr)
             sys.exit(2)

@@ -94,7 +94,8 @@ def compose(name: str, overrides: Iterable[str] = (), hydra: bool = False) -> Di
             if match is None or not overrides:
                 raise UserError(" ".join(str(error).split())) from None
             key = match[1].split("@")[0]
-            raise UserError(f"unknown key '{key}'{nearest(key, _keys(hydra_compose(name)))}") from None
+            chosen = [one for one in overrides if (conf_dir() / one.partition("=")[0]).is_dir()]  # env=..., algo=...
+            raise UserError(f"unknown key '{key}'{nearest(key, _keys(hydra_compose(name, chosen)))}") from None
 
 
 def validate(model: type[C], node: DictConfig) -> C:
@@ -175,7 +176,9 @@ def _import(name: str, path: str) -> Any:
     while module:
         try:
             found = importlib.import_module(module)
-        except ModuleNotFoundError:
+        except ModuleNotFoundError as error:
+            if not f"{module}.".startswith(f"{error.name}."):  # it is there, and needs what is not
+                raise ValueError(f"{path}._target_: {name} needs '{error.name}', which is not installed") from None
             outer, _, inner = module.rpartition(".")
             module, attribute = outer, f"{inner}.{attribute}"
             continue

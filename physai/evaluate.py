@@ -14,21 +14,24 @@ if TYPE_CHECKING:
 
 
 class PolicyChoice(Config):
-    """Which policy, and how the robots differ that it drives."""
+    """Which policy, and the robots that it drives."""
 
     run: str
     checkpoint: str | int
+    env: dict[str, Any] | None
     randomization: dict[str, Any] | None
 
     def load(self) -> "TrainedPolicy":
         """Read it; raises a UserError if something is missing or damaged."""
+        from physai.envs.simulation import EnvConfig
         from physai.physics import RandomizationConfig
         from physai.training.run import TrainedPolicy
 
-        chosen = None
+        env = None if self.env is None else validate(EnvConfig, DictConfig(self.env))
+        randomization = None
         if self.randomization is not None:
-            chosen = validate(RandomizationConfig, DictConfig(self.randomization))
-        return TrainedPolicy(Path(self.run), str(self.checkpoint), chosen)
+            randomization = validate(RandomizationConfig, DictConfig(self.randomization))
+        return TrainedPolicy(Path(self.run), str(self.checkpoint), randomization, env)
 
 
 class EvaluateConfig(PolicyChoice):
@@ -50,12 +53,14 @@ def _evaluate(node: DictConfig, _: Path) -> None:
     policy = config.load()
     seed = FINAL_SEED if config.seed is None else config.seed
     summary = policy.evaluate(config.episodes, seed).summary() | {
+        "env": policy.config.env.name,
         "randomization": policy.randomization.name,
         "checkpoint": config.checkpoint,
         "episodes": config.episodes,
         "seed": seed,
     }
-    output = Path(config.run) / f"evaluation_{policy.randomization.name}.json"
+    names = [policy.randomization.name] if config.env is None else [policy.config.env.name, policy.randomization.name]
+    output = Path(config.run) / f"evaluation_{'_'.join(names)}.json"
     checkpoint.write(output, json.dumps(summary, indent=2).encode())
     print_summary(summary, f"{config.run}: {config.checkpoint}, on {config.episodes:,} goals")
 

@@ -1,6 +1,7 @@
 """``python -m physai.play``: watch the policy of a run (see ``--help``)."""
 
 import time
+from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -53,7 +54,7 @@ def _play(node: DictConfig, _: Path) -> None:
                 frames.append(image)
 
     reached = 0
-    with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
+    with closing(env), closing(viewer), torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
         for goal in range(config.goals):
             tensordict = env.reset()
             show()
@@ -64,8 +65,6 @@ def _play(node: DictConfig, _: Path) -> None:
             outcome = "reached" if tensordict["terminated"] else "missed"
             print(f"goal {goal + 1}: {outcome} in {tensordict['episode_length'].item() * dt:.2f} s")
             show(_PAUSE)
-    viewer.close()
-    env.close()
     print(f"{reached} of {config.goals} goals reached")
     if not human:
         output = Path(config.output) if config.output else Path(config.run) / "play.mp4"

@@ -95,6 +95,11 @@ BAD_TRAINING = {
     ),
     "too fast": (["env.max_velocity=9"], "beyond the limit of 'planar_arm', 2.5 rad/s"),
     "reversed range": (["randomization.payload.low=3"], "randomization.payload"),
+    "a robot behind ROS": (["env=ros_reacher"], "a policy is trained on simulated robots; this one it can drive with"),
+    "unknown physics": (
+        ["env.physics._target_=physai.physics.pybullet.PyBulletPhysic"],
+        "physics._target_: physai.physics.pybullet has no 'PyBulletPhysic'; did you mean 'PyBulletPhysics'?",
+    ),
     "missing URDF": (["env.robot.urdf=/nowhere.urdf"], "/nowhere.urdf: no such URDF file"),
     "unknown joint": (["env.robot.joints=[joint1,joint3]"], "no joint 'joint3'; did you mean"),
     "not an override": (["total_frames"], "not an override such as key=value"),
@@ -217,6 +222,13 @@ def test_evaluate_says_how_sure_it_is_and_which_randomization_it_used(run, copie
     assert result["success_ci"][0] <= result["success_rate"] <= result["success_ci"][1]
 
 
+def test_evaluate_drives_another_env_and_names_its_file_after_it(run, copied):
+    code, _, error = run("evaluate", "run=run", "episodes=20", "env=reacher", "env.task.start_spread=[0.0,0.0]")
+    assert code == 0, error
+    result = json.loads((copied / "evaluation_reacher_default.json").read_text())
+    assert (result["env"], result["randomization"], result["episodes"]) == ("reacher", "default", 20)
+
+
 @pytest.mark.parametrize(
     ("module", "arguments", "message"),
     [
@@ -224,6 +236,25 @@ def test_evaluate_says_how_sure_it_is_and_which_randomization_it_used(run, copie
         ("evaluate", ["run=run", "checkpoint=7"], "no checkpoint '7'; there are: best"),
         ("evaluate", ["run=run", "episodes=0"], "episodes: input should be greater than 0"),
         ("evaluate", ["run=run", "randomization=stron"], "did you mean 'strong'?"),
+        ("evaluate", ["run=run", "env=ros_reachr"], "env/ros_reachr: no such config; did you mean 'ros_reacher'?"),
+        ("evaluate", ["run=run", "env=reacher", "env.task.tolerence=1"], "did you mean 'env.task.tolerance'?"),
+        ("evaluate", ["run=run", "env=reacher", "env.task.tolerance=-1"], "task.tolerance: input should be greater"),
+        (
+            "evaluate",
+            ["run=run", "env=kuka_reacher"],
+            "has the joints ['lbr_iiwa_joint_1', 'lbr_iiwa_joint_2'], the run's policy drives ['joint1', 'joint2']",
+        ),
+        ("play", ["run=run", "env=kuka_reacher"], "env 'kuka_reacher' has the joints"),
+        (
+            "evaluate",
+            ["run=run", "env=ros_reacher", "env.physics.remap=[joint_states]"],
+            "physics.remap: string should match pattern",
+        ),
+        (
+            "evaluate",
+            ["run=run", "env=reacher", "env.physics._target_=physai.ros.RosPhysics"],
+            "env.physics: RosPhysics.__init__() missing 4 required positional arguments: 'homing_speed'",
+        ),
         ("evaluate", [], "run=... is required"),
         ("play", ["run=run", "output=arm.avi"], "must end in .mp4 or .gif"),
         ("play", ["run=run", "render=windw"], "render: input should be 'video' or 'human'"),

@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 
 from physai.config import compose, conf_dir, validate
+from physai.errors import UserError
 from physai.training.agent import Agent
 from physai.training.config import TrainConfig
 
@@ -22,6 +23,10 @@ def choices(group: str) -> list[str]:
 )
 def test_every_choice_builds_and_collects(override):
     config = validate(TrainConfig, compose("train", [override, *SMALL]))
+    if not config.env.simulated:
+        with pytest.raises(UserError, match="a policy is trained on simulated robots"):
+            Agent.build(config)
+        return
     agent = Agent.build(config)
     batch = next(iter(agent.collector))
     assert batch.shape == (4, 16)

@@ -1,9 +1,14 @@
 """The README's Python examples do what they show."""
 
+import dataclasses
 import re
 from pathlib import Path
 
 import pytest
+
+from physai.ros.command_watchdog import WatchdogConfig
+from physai.ros.inference_node import InferenceConfig
+from physai.ros.virtual_robot import VirtualRobotConfig
 
 README = (Path(__file__).parent.parent / "README.md").read_text()
 BLOCKS = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
@@ -24,3 +29,28 @@ def test_the_controller_of_the_readme_reaches_its_goal(exported_run, monkeypatch
     printed = capsys.readouterr().out
     assert "('joint1', 'joint2') (0.3, 0.53) 50.0" in printed
     assert "State.REACHED" in printed
+
+
+def parameter_tables() -> dict[str, list[list[str]]]:
+    """Rows of the README's tables of ROS parameters, by node."""
+    tables = re.findall(r"\| (\w+) \| default \| unit \| \|\n\|[-|]+\|\n((?:\|.*\|\n)+)", README)
+    return {
+        node: [[cell.strip() for cell in row.strip("|").split("|")] for row in rows.splitlines()]
+        for node, rows in tables
+    }
+
+
+@pytest.mark.parametrize(
+    ("node", "kind"),
+    [("inference_node", InferenceConfig), ("virtual_robot", VirtualRobotConfig), ("command_watchdog", WatchdogConfig)],
+)
+def test_the_readme_names_every_parameter_of_a_node_with_its_default_and_unit(node, kind):
+    shown = {row[0]: row[1:] for row in parameter_tables()[node]}
+    expected = {}
+    for field in dataclasses.fields(kind):
+        default = field.default
+        text = f"{default:g}" if isinstance(default, float) else str(default)
+        text = "" if default in ("", ()) else text.lower() if isinstance(default, bool) else text
+        star = " *" if field.metadata["fixed"] else ""
+        expected[f"`{field.name}`{star}"] = [text, field.metadata["unit"], field.metadata["description"]]
+    assert shown == expected

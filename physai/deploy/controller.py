@@ -268,7 +268,7 @@ class Controller:
             reasons.append(self._latch_reason)
             return self._latched
         if self._position is None:
-            reasons.append("no joint state yet")
+            reasons += ["no joint state yet", *interlocks]
             return State.WAITING
         if self._needed:
             reasons.append(f"{self._needed} more good joint states are needed")

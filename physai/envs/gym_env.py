@@ -83,7 +83,8 @@ class RobotGymEnv(gymnasium.Env[Array, Array]):
     def _show(self) -> None:
         if self.render_mode == "human":
             self._picture()
-            time.sleep(self.simulation.config.control_dt)
+            if self.simulation.config.simulated:  # what is not takes its time by itself
+                time.sleep(self.simulation.config.control_dt)
 
     def _picture(self) -> Array | None:
         if self._viewer is None:

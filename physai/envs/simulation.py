@@ -3,26 +3,35 @@
 from typing import Any
 
 import torch
-from hydra.utils import instantiate
+from hydra.utils import get_object, instantiate
 from torch import Tensor
 
 from physai.config import Config, Count, PositiveFloat, Target
 from physai.errors import UserError
 from physai.physics import ParameterLayout, Physics
-from physai.physics.pybullet import PyBulletPhysics
 from physai.physics.viewer import Viewer
 from physai.robots import ForwardKinematics, RobotConfig, RobotSpec
 
 
 class EnvConfig(Config):
-    """One file of ``conf/env``: a robot, a task, and how they run."""
+    """One file of ``conf/env``: a robot, a task, and how they run.
+
+    ``physics`` names a :class:`physai.physics.Physics`, and what its constructor takes beside robot, number, control
+    period and substeps.
+    """
 
     name: str
     robot: RobotConfig
     task: Target
+    physics: Target
     control_dt: PositiveFloat
     substeps: Count
     max_velocity: PositiveFloat
+
+    @property
+    def simulated(self) -> bool:
+        """Whether there can be many of its robots, which are put anywhere and given other dynamics."""
+        return bool(get_object(self.physics["_target_"]).simulated)
 
 
 class Simulation:
@@ -57,7 +66,11 @@ class Simulation:
                 f"{self.spec.velocity_limit.min():g} rad/s"
             )
         self.observation = self.task.observation(self.spec, self.kinematics)
-        self.physics: Physics = PyBulletPhysics(self.spec, num_envs, config.control_dt, config.substeps)
+        make_physics = instantiate(config.physics, _partial_=True, _convert_="all")
+        try:
+            self.physics: Physics = make_physics(self.spec, num_envs, config.control_dt, config.substeps)
+        except TypeError as error:  # arguments that are missing
+            raise UserError(f"env.physics: {error}") from None
         self.generator = torch.Generator()
         self.seed(seed)
         joints = len(self.spec.joints)

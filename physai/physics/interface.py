@@ -1,6 +1,6 @@
 """What the rest of physai expects of a physics engine."""
 
-from typing import Protocol
+from typing import ClassVar, Protocol
 
 import numpy as np
 
@@ -26,8 +26,14 @@ def nominal_dynamics(spec: RobotSpec) -> DynamicsParameters:
 
 
 class Physics(Protocol):
-    """N robots with n velocity-controlled joints each; arrays are float64, robots are rows."""
+    """N robots with n velocity-controlled joints each; arrays are float64, robots are rows.
 
+    Attributes:
+        simulated: Whether N is free, and robots can be put into any state and given other dynamics. What is not
+            simulated may refuse all of this with a UserError.
+    """
+
+    simulated: ClassVar[bool]
     num_robots: int
 
     def reset(

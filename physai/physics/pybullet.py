@@ -41,6 +41,8 @@ class PyBulletPhysics:
         UserError: If PyBullet refuses the URDF, or has no room for so many worlds.
     """
 
+    simulated = True
+
     def __init__(self, spec: RobotSpec, num_robots: int, control_dt: float, substeps: int = 1) -> None:
         self.num_robots = num_robots
         self.substeps = substeps

@@ -85,6 +85,11 @@ class RandomizationConfig(Config):
     position_noise: Draw | None
     velocity_noise: Draw | None
 
+    @classmethod
+    def none(cls) -> "RandomizationConfig":
+        """Return what leaves everything as it is."""
+        return cls.model_validate({**dict.fromkeys(cls.model_fields), "name": "none"})
+
     @property
     def draws(self) -> dict[str, Draw]:
         """The parameters that are drawn."""

@@ -22,7 +22,9 @@ from physai.ros.diagnostics import Timing, diagnose
 from physai.ros.parameters import declare
 from physai.ros.run import StoppableNode, run
 
-_DISCOVERY = 0.5  # s; the slowest of all discoveries that were measured took 0.4
+# The slowest of all discoveries that were measured took 0.4 s. It counts from when the controller is found: an
+# emergency stop that was pressed before, or another node that commands, may be found after it.
+_DISCOVERY = 0.5  # s
 
 
 @dataclass(frozen=True)
@@ -51,7 +53,7 @@ class InferenceNode(StoppableNode):
 
     def __init__(self) -> None:
         super().__init__("inference_node")
-        self._started = time.monotonic()
+        self._unheard = time.monotonic()  # when no controller listened, for the last time
         self.config = config = declare(self, InferenceConfig, lambda changed: self._controller.configure(changed))
         policy = _load(config)
         self._controller = Controller(policy, config)
@@ -61,6 +63,7 @@ class InferenceNode(StoppableNode):
         self._enabled = config.autostart
         self._publishing = False  # whether this node has a say in what the arm does
         self._contested = False
+        self._blocked: list[str] = []  # by interlocks
         self._late = 1.5 / config.rate_hz
         self._timing = Timing()
         joints = config.joints or policy.metadata.joints
@@ -170,28 +173,30 @@ class InferenceNode(StoppableNode):
         command = self._controller.update(now, joint_state, goal, interlocks)
         self._publish(command)
         before, self._command = self._command, command
-        if goal is not None:
-            for reason in command.reasons:
-                if reason.startswith("goal"):
-                    self.get_logger().warning(reason)
-        if command.state is not before.state:
+        for reason in command.reasons:
+            if reason.startswith("goal"):
+                self.get_logger().warning(reason)
+            elif reason.startswith("joint state rejected"):
+                self.get_logger().warning(reason, throttle_duration_sec=1.0)
+        if command.state is not before.state or interlocks != self._blocked:
+            self._blocked = interlocks
             self._announce()
 
     def _interlocks(self, now: float) -> list[str]:
         """Why the arm must not move, beside what the controller knows."""
         found = [] if self._enabled else ["not enabled"]
-        if now - self._started < _DISCOVERY:
-            return [*found, "looking for other nodes"]
         rival = self._commands.rival
         if rival is not None:
             found.append(f"another publisher commands {self._commands.topic}: {rival}")
-            if not self._contested and self._command.state in (State.ACTIVE, State.REACHED):
-                # It will not go on by itself when the other one leaves.
-                self._controller.forget_goal()
+            if not self._contested and self._publishing:
+                self._controller.forget_goal()  # this node shall not go on by itself when the other one leaves
         self._contested = rival is not None
         if not self._commands.heard:
             found.append(f"no controller listens to {self._commands.topic}")
-        if self._enabled and not self._contested:
+            self._unheard = now
+        elif now - self._unheard < _DISCOVERY:
+            found.append("looking for other nodes")
+        elif self._enabled and not self._contested:
             self._publishing = True
         return found
 

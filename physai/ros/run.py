@@ -61,13 +61,17 @@ def run(make_node: Callable[[], StoppableNode], module: str, about: str, kind: t
         description=f"{about}\n\nParameters, with their defaults:\n{help_text(kind)}",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.parse_args(remove_ros_args(sys.argv)[1:])
+    try:
+        arguments = remove_ros_args(sys.argv)[1:]
+    except RuntimeError as error:  # RCLError: such as a file of parameters that does not exist
+        return _refuse(_brief(error))
+    parser.parse_args(arguments)
     prepare_middleware()
     with _signals() as caught:
         try:
             rclpy.init(args=sys.argv, signal_handler_options=SignalHandlerOptions.NO)
         except RuntimeError as error:  # RCLError
-            return _refuse(str(error).splitlines()[0].split(", at /")[0])
+            return _refuse(_brief(error))
         try:
             return _run(make_node, caught)
         finally:
@@ -112,6 +116,11 @@ def _signals() -> Iterator[list[int]]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+def _brief(error: Exception) -> str:
+    """What ROS says, without its lines of source code."""
+    return str(error).splitlines()[0].split(", at /")[0]
 
 
 def _refuse(reason: str) -> int:

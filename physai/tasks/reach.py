@@ -127,6 +127,9 @@ class Reach:
 
     def sample_start(self, rows: int, spec: RobotSpec, generator: torch.Generator) -> Tensor:
         """Draw joint positions [rows, n], rad, around the home pose and within the limits."""
+        if not any(self.start_spread):
+            # Nothing is drawn: a seed gives the same goals to robots one after the other as to robots side by side.
+            return torch.from_numpy(spec.home).repeat(rows, 1)
         draw = 2 * torch.rand(rows, len(spec.joints), generator=generator, dtype=torch.float64) - 1
         start = torch.from_numpy(spec.home) + draw * torch.tensor(self.start_spread, dtype=torch.float64)
         lower, upper = torch.from_numpy(spec.position_limit).T

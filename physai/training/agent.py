@@ -40,6 +40,11 @@ class Agent:
         Raises:
             UserError: If a part cannot be built from its config.
         """
+        if not config.env.simulated:
+            raise UserError(
+                f"env={config.env.name}: a policy is trained on simulated robots; this one it can drive with "
+                f"python -m physai.evaluate run=<run> env={config.env.name}"
+            )
         torch.set_num_threads(config.threads)
         torch.manual_seed(derive(config.seed, "learner"))
         env = make_env(

@@ -12,6 +12,7 @@ from tensordict.nn import TensorDictModuleBase
 
 from physai.config import validate
 from physai.envs.make import TransformedRobotEnv
+from physai.envs.simulation import EnvConfig
 from physai.errors import UserError
 from physai.physics import RandomizationConfig
 from physai.plotting import plot_runs
@@ -78,31 +79,51 @@ class TrainedPolicy:
     Args:
         run_dir: The run folder.
         which: ``best``, ``last``, or a number of frames.
-        randomization: How robots differ; None takes the run's own evaluation.
+        randomization: How robots differ; None takes the run's own evaluation, or none for robots that are not
+            simulated.
+        env: What it drives; None takes the run's own.
 
     Attributes:
+        config: The run's, with that env.
         frames: How many the policy had been trained on.
 
     Raises:
-        UserError: If there is no such run or checkpoint, or it is damaged.
+        UserError: If there is no such run or checkpoint, it is damaged, or the env's robot has other joints.
     """
 
-    def __init__(self, run_dir: Path, which: str, randomization: RandomizationConfig | None = None) -> None:
+    def __init__(
+        self,
+        run_dir: Path,
+        which: str,
+        randomization: RandomizationConfig | None = None,
+        env: EnvConfig | None = None,
+    ) -> None:
         self.config = load_config(run_dir)
-        self.randomization = randomization or self.config.evaluation.randomization
+        own = self.config.evaluation.randomization
+        if env is not None:
+            trained, given = self.config.env.robot.joints, env.robot.joints
+            if given != trained:
+                raise UserError(f"env '{env.name}' has the joints {given}, the run's policy drives {trained}")
+            self.config = self.config.model_copy(update={"env": env})
+            own = own if env.simulated else RandomizationConfig.none()
+        self.randomization = randomization or own
         self._state = checkpoint.load(checkpoint.CheckpointFolder(run_dir / "checkpoints", 1).find(which))
         self.frames = int(self._state["frames"])
 
     def deploy(self, num_envs: int, seed: int) -> tuple[TensorDictModuleBase, TransformedRobotEnv]:
         """Build the actor, and an env with the statistics that it was trained with."""
         env = make_evaluation_env(self.config, self.randomization, num_envs, seed)
-        actor = make_actor(self.config, env)
-        load_policy_state(actor, env, self._state)
+        try:
+            actor = make_actor(self.config, env)
+            load_policy_state(actor, env, self._state)
+        except BaseException:
+            env.close()
+            raise
         return actor, env
 
     def evaluate(self, episodes: int, seed: int = FINAL_SEED) -> Evaluation:
         """Judge it on so many goals."""
-        actor, env = self.deploy(min(episodes, MAX_ROBOTS), seed)
+        actor, env = self.deploy(min(episodes, MAX_ROBOTS) if self.config.env.simulated else 1, seed)
         try:
             return evaluate(actor, env, episodes, seed)
         finally:

@@ -208,6 +208,16 @@ def test_a_state_that_was_taken_can_be_gone_back_to_after_any_detour(make_env):
     assert_equal(found, expected)
 
 
+def test_a_seed_gives_the_same_goals_to_robots_one_after_the_other_as_side_by_side(make_env):
+    home = {"randomization": "none", "overrides": ["env.task.start_spread=[0.0,0.0]"]}
+    together, alone = make_env(num_envs=50, **home), make_env(num_envs=1, **home)
+    for env in (together, alone):
+        env.set_seed(3)
+    goals = together.reset()["goal"]
+    assert torch.equal(goals, torch.cat([alone.reset()["goal"] for _ in range(50)]))
+    assert torch.equal(together.simulation.joint_position, torch.zeros(50, 2))
+
+
 def test_make_env_works_as_the_readme_shows():
     env = physai.make_env("reacher", num_envs=8, seed=0, overrides=["randomization=none"])
     td = env.rollout(3)

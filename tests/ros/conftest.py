@@ -14,6 +14,8 @@ from physai.ros.run import prepare_middleware
 
 prepare_middleware()
 
+from tests.ros.forge import close_forges
+from tests.ros.loop import Loop, closed_loop
 from tests.ros.peer import SHM, Peer, Process, free_domain, node_command, remove_dead_segments
 
 
@@ -22,6 +24,7 @@ def _no_shared_memory_left() -> Iterator[None]:
     """Nodes that are killed, as many here are, leave segments behind; LTTng leaves its own after everyone."""
     traced = set(SHM.glob("lttng-ust-wait*"))
     yield
+    close_forges()
     remove_dead_segments()
     for path in set(SHM.glob("lttng-ust-wait*")) - traced:
         path.unlink(missing_ok=True)
@@ -57,6 +60,13 @@ def peer(domain: int) -> Iterator[Peer]:
     made.close()
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def policy_path(exported_run: Path) -> Path:
     return exported_run / "policy.pt"
+
+
+@pytest.fixture(scope="module")
+def loop(policy_path: Path) -> Iterator[Loop]:
+    """The inference node and an arm, shared by the tests of a module; each begins with ``loop.start()`` or the like."""
+    with closed_loop(policy_path) as made:
+        yield made

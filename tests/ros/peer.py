@@ -15,9 +15,12 @@ from typing import Any
 
 import rclpy
 from geometry_msgs.msg import PointStamped
+from rcl_interfaces.msg import SetParametersResult
+from rcl_interfaces.srv import SetParameters
 from rclpy.context import Context
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
 from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import JointState
@@ -72,16 +75,21 @@ class Process:
     def pid(self) -> int:
         return self._popen.pid
 
+    def poll(self) -> int | None:
+        """Exit code, or None while it runs."""
+        return self._popen.poll()
+
     def says(self, text: str, timeout: float = 20.0) -> str:
         """Wait for a line with this text, and return it."""
 
         def found() -> str | None:
             return next((line for line in self.lines if text in line), None)
 
-        wait_for(lambda: found() or self._popen.poll() is not None, timeout, f"{text!r} in:\n{self.output}")
-        self._reader.join(0.0 if self._popen.poll() is None else 2.0)
+        wait_for(lambda: found() or self.poll() is not None, timeout, f"{text!r} in:\n{self.output}")
+        if self.poll() is not None:
+            self.wait()
         line = found()
-        assert line is not None, f"ended with {self._popen.poll()} without {text!r}:\n{self.output}"
+        assert line is not None, f"ended with {self.poll()} without {text!r}:\n{self.output}"
         return line
 
     def signal(self, number: int) -> None:
@@ -125,6 +133,7 @@ class Peer:
     """
 
     def __init__(self, domain: int, listen_to_commands: bool = True) -> None:
+        self.domain = domain
         self._context = Context()
         rclpy.init(context=self._context, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
         self.node = Node("peer", context=self._context)
@@ -137,6 +146,7 @@ class Peer:
         self.listen(String, "/inference_node/state", self.states, qos.LATCHED, lambda message: message.data)
         self.listen(JointState, "/joint_states", self.joint_states, 10)
         self._publishers: dict[tuple[Any, ...], Any] = {}
+        self._clients: dict[str, Any] = {}
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self.node)
         self._thread = threading.Thread(target=self._spin, daemon=True)
@@ -153,9 +163,9 @@ class Peer:
         into: list[Any],
         profile: QoSProfile | int,
         read: Callable[[Any], Any] = lambda message: message,
-    ) -> None:
+    ) -> Any:
         """Append (time, what ``read`` makes of the message) for every message."""
-        self.node.create_subscription(
+        return self.node.create_subscription(
             kind, topic, lambda message: into.append((time.monotonic(), read(message))), profile
         )
 
@@ -187,14 +197,15 @@ class Peer:
         return self.call_service(kind, service, request)
 
     def call_service(self, kind: type, service: str, request: Any, timeout: float = 20.0) -> Any:
-        client = self.node.create_client(kind, service)
-        try:
-            wait_for(client.service_is_ready, timeout, f"service {service}")
-            future = client.call_async(request)
-            wait_for(future.done, timeout, f"answer of {service}")
-            return future.result()
-        finally:
-            self.node.destroy_client(client)
+        if service not in self._clients:
+            self._clients[service] = self.node.create_client(kind, service)
+        wait_for(self._clients[service].service_is_ready, timeout, f"service {service}")
+        future = self._clients[service].call_async(request)
+        wait_for(future.done, timeout, f"answer of {service}")
+        return future.result()
+
+    def enable(self, on: bool = True) -> SetBool.Response:
+        return self.call("/inference_node/enable", SetBool.Request(data=on))
 
     def wait_state(self, *names: str, timeout: float = 30.0, after: float = 0.0) -> tuple[float, str]:
         """Wait until the node's last announced state is one of these (announced after a time, if given)."""
@@ -204,6 +215,43 @@ class Peer:
             return last if last and last[1] in names and last[0] >= after else None
 
         return wait_for(there, timeout, f"state {names}; had {self.states[-5:]}")
+
+    def set_parameters(self, node: str, **values: Any) -> list[SetParametersResult]:
+        """Ask a node to change parameters, each for itself."""
+        parameters = [Parameter(name, value=value).to_parameter_msg() for name, value in values.items()]
+        request = SetParameters.Request(parameters=parameters)
+        return self.call_service(SetParameters, f"{node}/set_parameters", request).results
+
+    def moved(self, after: float = 0.0, commands: int = 5) -> float:
+        """Wait for commands that move the arm and came after a time; return the time of the last of them."""
+
+        def found() -> list[float] | None:
+            times = [at for at, velocity in list(self.commands) if at > after and any(velocity)]
+            return times if len(times) >= commands else None
+
+        return wait_for(found, 30.0, "an arm that is told to move")[-1]
+
+    def first_zeros(self, after: float, timeout: float = 20.0) -> float:
+        """Wait for a command of zeros that came after a time, and return how much later it came."""
+
+        def found() -> float | None:
+            return next((at for at, velocity in reversed(self.commands) if at > after and not any(velocity)), None)
+
+        wait_for(found, timeout, "zeros")
+        return next(at for at, velocity in self.commands if at > after and not any(velocity)) - after
+
+    def all_zeros(self, after: float, commands: int = 10) -> None:
+        """See that all commands after a time are zeros, until enough have come."""
+        came = wait_for(lambda: len(found := self._after(after)) >= commands and found, 20.0, "more commands")
+        assert not any(any(velocity) for velocity in came), came
+
+    def _after(self, after: float) -> list[list[float]]:
+        return [velocity for at, velocity in list(self.commands) if at > after]
+
+    def silent(self, seconds: float = 0.2) -> None:
+        """Wait until no command has come for a while: those that were under way are here."""
+        since = time.monotonic()
+        wait_for(lambda: time.monotonic() - max([since, *(at for at, _ in self.commands[-1:])]) > seconds)
 
     def close(self) -> None:
         self._executor.shutdown()
@@ -226,21 +274,38 @@ def free_domain() -> Iterator[int]:
     raise RuntimeError("all domains are taken")
 
 
+def mapped_segments(pid: str = "[0-9]*") -> set[Path]:
+    """Fast DDS' shared memory that living processes use."""
+    found = set()
+    for maps in Path("/proc").glob(f"{pid}/maps"):
+        with contextlib.suppress(OSError):  # it has just ended, or is another user's
+            found.update(Path(line.split()[-1]) for line in maps.read_text().splitlines() if "/fastrtps_" in line)
+    return found
+
+
 def remove_dead_segments() -> list[str]:
-    """Remove Fast DDS' shared memory of processes that were killed; the living hold a lock on theirs."""
-    removed = []
-    for segment in SHM.glob("fastrtps_*[0-9a-f]"):
-        lock = segment.with_name(f"{segment.name}_el")
-        try:
-            with open(lock) as file:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            dead = True
-        except BlockingIOError:
-            dead = False
-        except FileNotFoundError:  # a killed process's, or one so new that it has no lock yet
-            dead = segment.exists() and time.time() - segment.stat().st_mtime > 5.0
-        for path in (lock, segment, SHM / f"sem.{segment.name}_mutex") if dead else ():
-            with contextlib.suppress(FileNotFoundError):
+    """Remove Fast DDS' shared memory of processes that were killed; the living hold a lock on theirs, or map it."""
+    removed, unlocked = [], []
+
+    def remove(segment: Path) -> None:
+        for path in (segment.with_name(f"{segment.name}_el"), segment, SHM / f"sem.{segment.name}_mutex"):
+            with contextlib.suppress(FileNotFoundError, PermissionError):
                 path.unlink()
                 removed.append(path.name)
+
+    for segment in SHM.glob("fastrtps_*[0-9a-f]"):
+        try:
+            with open(segment.with_name(f"{segment.name}_el")) as file:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            remove(segment)
+        except (BlockingIOError, PermissionError):
+            continue
+        except FileNotFoundError:
+            unlocked.append(segment)
+    if unlocked:
+        # A port without a reader; or one so new that it has no lock yet.
+        before = mapped_segments()
+        time.sleep(0.2)
+        for segment in set(unlocked) - before - mapped_segments():
+            remove(segment)
     return removed

@@ -1,0 +1,56 @@
+"""A policy drives an arm: ros2 launch physai arm.launch.py policy_path:=/path/to/policy.pt use_virtual_robot:=true."""
+
+from ament_index_python.packages import get_package_share_directory
+from launch import LaunchContext, LaunchDescription
+from launch.actions import DeclareLaunchArgument, OpaqueFunction
+from launch.substitutions import LaunchConfiguration
+from launch_ros.actions import Node
+
+COMMANDS = "/joint_velocity_controller/commands"
+SAFE_COMMANDS = "/command_watchdog/commands"
+
+
+def generate_launch_description() -> LaunchDescription:
+    """Tell what can be chosen."""
+    parameters = get_package_share_directory("physai") + "/config/physai.yaml"
+    return LaunchDescription(
+        [
+            DeclareLaunchArgument("policy_path", description="policy.pt of a run"),
+            DeclareLaunchArgument("params_file", default_value=parameters, description="parameters of all nodes"),
+            DeclareLaunchArgument(
+                "use_virtual_robot",
+                default_value="false",
+                choices=["true", "false"],
+                description="instead of a real one",
+            ),
+            DeclareLaunchArgument(
+                "use_watchdog",
+                default_value="true",
+                choices=["true", "false"],
+                description="a relay that stops the arm when commands stop",
+            ),
+            OpaqueFunction(function=make_nodes),
+        ]
+    )
+
+
+def make_nodes(context: LaunchContext) -> list[Node]:
+    """Return the nodes that were chosen."""
+    policy_path, params_file, use_virtual_robot, use_watchdog = (
+        LaunchConfiguration(name).perform(context)
+        for name in ("policy_path", "params_file", "use_virtual_robot", "use_watchdog")
+    )
+    node = {"package": "physai", "output": "screen"}
+    nodes = [
+        Node(
+            executable="inference_node",
+            parameters=[params_file, {"policy_path": policy_path}],
+            remappings=[(COMMANDS, SAFE_COMMANDS)] if use_watchdog == "true" else [],
+            **node,
+        )
+    ]
+    if use_watchdog == "true":
+        nodes.append(Node(executable="command_watchdog", parameters=[params_file], **node))
+    if use_virtual_robot == "true":
+        nodes.append(Node(executable="virtual_robot", parameters=[params_file], **node))
+    return nodes

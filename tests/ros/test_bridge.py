@@ -1,0 +1,150 @@
+"""The same task over topics: Gymnasium's rules, and policies of simulated robots on one behind ROS."""
+
+import json
+import shutil
+import signal
+import subprocess
+import sys
+import warnings
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+
+import physai
+from tests.ros.peer import wait_for
+
+NAME = "physai/RosReacher-v0"
+WITHOUT_ROS = "import sys; sys.modules['rclpy'] = None\n"  # as if it were not installed
+
+
+@pytest.fixture
+def make(domain, monkeypatch):
+    """Make the env in the test's domain; it is closed after the test."""
+    monkeypatch.setenv("ROS_DOMAIN_ID", str(domain))
+    made = []
+
+    def make_env(**options):
+        made.append(gymnasium.make(NAME, **options))
+        return made[-1]
+
+    yield make_env
+    for env in made:
+        env.close()
+
+
+@pytest.fixture
+def run(exported_run, tmp_path):
+    """A trained run that may be written to."""
+    shutil.copytree(exported_run, tmp_path / "run")
+    return tmp_path / "run"
+
+
+def evaluate(*arguments):
+    return [sys.executable, "-m", "physai.evaluate", *map(str, arguments)]
+
+
+def in_fresh_python(script):
+    return subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=120)
+
+
+def test_gymnasium_s_checker_passes_without_a_warning(start, make):
+    start("virtual_robot")
+    env = make().unwrapped
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        # These two make further envs while this one commands the robot; the next test does what they do.
+        check_env(env, skip_render_check=True, skip_close_check=True)
+
+
+def test_it_renders_and_closes_twice(start, make):
+    start("virtual_robot")
+    env = make(render_mode="rgb_array")
+    env.reset(seed=0)
+    assert env.render().shape == (360, 480, 3)
+    env.close()
+    env.close()
+
+
+def test_a_second_env_does_not_disturb_the_first(start, make):
+    start("virtual_robot")
+    env = make()
+    env.reset(seed=0)
+    with pytest.raises(physai.UserError, match="another publisher commands"):
+        make()
+
+
+def test_an_episode_over_ros_is_the_episode_in_process(start, make):
+    start("virtual_robot")
+    ours = make()
+    theirs = gymnasium.make("physai/Reacher-v0", overrides=["env.task.start_spread=[0.0,0.0]"])
+    assert ours.observation_space == theirs.observation_space
+    assert ours.action_space == theirs.action_space
+    first, expected = (env.reset(seed=3)[0] for env in (ours, theirs))
+    np.testing.assert_array_equal(first[-2:], expected[-2:])  # the goal
+    np.testing.assert_allclose(first, expected, atol=0.02)
+    for _ in range(25):
+        (*seen, _), (*wanted, _) = (env.step(np.array([0.3, -0.2], np.float32)) for env in (ours, theirs))
+        assert seen[2:] == wanted[2:]
+    # The robot runs on a clock of its own: up to a period of 10 ms older, and its commands as much later.
+    np.testing.assert_allclose(seen[0], wanted[0], atol=0.05)
+    assert seen[1] == pytest.approx(wanted[1], abs=0.05)
+    theirs.close()
+
+
+def test_without_rclpy_one_line_says_what_to_install():
+    done = in_fresh_python(
+        WITHOUT_ROS + "import gymnasium, physai\n"
+        "try: gymnasium.make('physai/RosReacher-v0')\n"
+        "except physai.UserError as error: print(error)\n"
+    )
+    assert done.stdout == "rclpy is not installed: pip install 'physai[ros]', or source ROS 2 Jazzy\n", done.stderr
+
+
+def test_the_other_envs_need_no_rclpy():
+    done = in_fresh_python(WITHOUT_ROS + "import physai; physai.make_env('reacher', 2).close()")
+    assert done.returncode == 0, done.stderr
+
+
+def test_where_there_is_no_robot_evaluate_says_so_in_one_line(start, run):
+    command = start.run(evaluate(f"run={run}", "env=ros_reacher"))
+    assert command.wait(60.0) == 2
+    assert command.says("error:") == "error: no joint state came on /joint_states within 5 s"
+    assert not list(run.glob("evaluation_*"))
+
+
+def test_evaluate_refuses_to_randomize_a_robot_behind_ros(start, peer, run):
+    start("virtual_robot")
+    command = start.run(evaluate(f"run={run}", "env=ros_reacher", "randomization=default"))
+    assert command.wait(60.0) == 2
+    assert "cannot be set; choose randomization=none" in command.says("error:")
+    assert not any(any(velocity) for _, velocity in peer.commands)
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_an_interrupted_evaluation_leaves_a_standing_arm(start, peer, run, number, code):
+    start("virtual_robot")
+    command = start.run(evaluate(f"run={run}", "env=ros_reacher"))
+    wait_for(lambda: any(any(velocity) for _, velocity in peer.commands), 60.0, "a command")
+    command.signal(number)
+    assert command.wait() == code
+    wait_for(lambda: [any(velocity) for _, velocity in peer.commands[-5:]] == [False] * 5)
+    assert "Traceback" not in command.output
+    assert not list(run.glob("evaluation_*"))
+
+
+@pytest.mark.slow
+def test_a_policy_reaches_the_same_goals_over_ros_as_in_process(start, run):
+    start("virtual_robot")
+    here = ["env=reacher", "env.task.start_spread=[0.0,0.0]", "randomization=none"]
+    for arguments in (["env=ros_reacher"], here):
+        command = start.run(evaluate(f"run={run}", "episodes=50", *arguments))
+        assert command.wait(280.0) == 0, command.output
+    over_ros, in_process = (
+        json.loads((run / f"evaluation_{name}_none.json").read_text()) for name in ("ros_reacher", "reacher")
+    )
+    for name, result in (("over ROS", over_ros), ("in process", in_process)):
+        print(f"{name}: {result['success_rate']:.0%} of 50 goals, {result['steps_to_goal']:.1f} steps to goal")
+    assert abs(over_ros["success_rate"] - in_process["success_rate"]) <= 1 / 50 + 1e-9
+    assert over_ros["steps_to_goal"] == pytest.approx(in_process["steps_to_goal"], abs=3.0)

@@ -1,0 +1,109 @@
+"""The emergency stop: by service and by topic, at once, until a reset."""
+
+import time
+
+import pytest
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from std_msgs.msg import Bool, String
+
+from physai.ros import qos
+from tests.ros.loop import FAR, closed_loop
+from tests.ros.peer import wait_for
+
+WITHIN = 0.02 + 0.03  # s: a period, and what the transport and a busy machine may take
+PROFILES = {
+    "best effort": QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT),
+    "reliable": QoSProfile(depth=10),
+    "latched": QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL),
+    "latched, best effort": QoSProfile(
+        depth=1, reliability=ReliabilityPolicy.BEST_EFFORT, durability=DurabilityPolicy.TRANSIENT_LOCAL
+    ),
+}
+
+
+@pytest.fixture(scope="module")
+def loop(policy_path):
+    with closed_loop(policy_path) as loop:
+        for profile in PROFILES.values():  # early enough to be known when they matter
+            loop.peer.publisher(Bool, "/emergency_stop", profile)
+        yield loop
+
+
+def stays_stopped(loop, since: float) -> None:
+    """Latched: neither a new goal nor ~/enable end it; and a late joiner is told."""
+    loop.peer.wait_state("estop")
+    loop.peer.send_goal(*FAR)
+    loop.peer.all_zeros(after=since + WITHIN)
+    late = {"state": [], "estopped": []}
+    loop.peer.listen(String, "/inference_node/state", late["state"], qos.LATCHED, lambda message: message.data)
+    loop.peer.listen(Bool, "/inference_node/estopped", late["estopped"], qos.LATCHED, lambda message: message.data)
+    wait_for(lambda: late["state"] and late["estopped"], what="the latched state")
+    assert (late["state"][0][1], late["estopped"][0][1]) == ("estop", True)
+
+
+def test_the_service_stops_the_arm_at_once_and_for_good(loop):
+    for _ in range(5):
+        loop.start()
+        since = time.monotonic()
+        answer = loop.peer.call("/inference_node/estop")
+        assert loop.peer.first_zeros(after=since) < WITHIN
+        assert answer.success
+        assert answer.message == "stopped until ~/reset"
+    stays_stopped(loop, since)
+
+
+@pytest.mark.parametrize("profile", PROFILES.values(), ids=PROFILES)
+def test_a_message_of_every_quality_of_service_stops_the_arm_at_once(loop, profile):
+    loop.start()
+    since = time.monotonic()
+    loop.peer.publish("/emergency_stop", Bool(data=True), profile)
+    assert loop.peer.first_zeros(after=since) < WITHIN
+    stays_stopped(loop, since)
+
+
+def test_only_a_reset_ends_it_and_the_goal_is_forgotten(loop):
+    since = loop.start()
+    loop.peer.call("/inference_node/estop")
+    assert "call ~/reset first" in loop.peer.enable().message
+    answer = loop.peer.call("/inference_node/reset")
+    assert answer.message == "waiting for a new goal"
+    since = time.monotonic()
+    loop.peer.wait_state("waiting")
+    loop.peer.all_zeros(after=since, commands=30)
+    assert loop.diagnosis()[2]["goal"] == ""
+    assert loop.peer.enable().success
+    loop.peer.send_goal(*FAR)
+    loop.peer.moved(after=since)
+
+
+def test_false_neither_stops_the_arm_nor_ends_a_stop(loop):
+    since = loop.start()
+    for profile in PROFILES.values():
+        loop.peer.publish("/emergency_stop", Bool(data=False), profile)
+    loop.peer.moved(after=time.monotonic(), commands=20)
+    assert all(any(velocity) for at, velocity in loop.peer.commands if at > since)
+    loop.peer.call("/inference_node/estop")
+    since, _ = loop.peer.wait_state("estop")
+    for profile in PROFILES.values():
+        loop.peer.publish("/emergency_stop", Bool(data=False), profile)
+    loop.peer.all_zeros(after=since, commands=20)
+    assert loop.peer.states[-1][1] == "estop"
+
+
+def test_one_that_was_pressed_before_the_node_started_counts(policy_path, peer):
+    peer.publisher(Bool, "/emergency_stop", PROFILES["latched"]).publish(Bool(data=True))
+    with closed_loop(policy_path, peer=peer, goal="[-0.3, -0.2]") as loop:
+        loop.peer.wait_state("estop")
+        loop.peer.all_zeros(after=0.0, commands=30)
+        assert loop.peer.call("/inference_node/reset").success
+        loop.peer.wait_state("waiting")
+        loop.peer.send_goal(*FAR)
+        loop.peer.moved()
+
+
+def test_it_is_taken_without_a_robot_and_without_being_enabled(policy_path):
+    with closed_loop(policy_path, autostart=False) as loop:
+        loop.arm.change = lambda message: None
+        loop.peer.emergency_stop()
+        loop.peer.wait_state("estop")
+        loop.peer.all_zeros(after=0.0)

@@ -1,0 +1,113 @@
+"""When the arm must not move though nothing is wrong with it: another commander, no controller, no permission."""
+
+import time
+
+import pytest
+from rosgraph_msgs.msg import Clock
+from std_msgs.msg import Float64MultiArray
+
+from tests.ros.loop import FAR, Loop, closed_loop
+from tests.ros.peer import TOPIC, Peer, free_domain, wait_for
+
+WITHIN = 0.15  # s
+GOAL = list(FAR)
+
+
+@pytest.fixture
+def rival(peer):
+    """A publisher of commands that says nothing; ``rival.leave()``."""
+    publisher = peer.node.create_publisher(Float64MultiArray, TOPIC, 1)
+    publisher.leave = lambda: peer.node.destroy_publisher(publisher)
+    return publisher
+
+
+def waits_because_of(loop: Loop, text: str) -> None:
+    wait_for(lambda: text in loop.diagnosis()[1], what=f"{text!r}; {loop.diagnosis()[1]}")
+    assert loop.peer.states[-1][1] == "waiting"
+
+
+def test_another_commander_from_before_the_start_is_not_disturbed(policy_path, rival, peer):
+    with closed_loop(policy_path, peer=peer, goal=GOAL) as loop:
+        waits_because_of(loop, f"another publisher commands {TOPIC}: peer")
+        assert peer.enable().success is False
+        assert peer.commands == []
+        rival.leave()
+        wait_for(lambda: peer.enable().success, what="permission after the other one has left")
+        peer.moved()
+
+
+def test_another_commander_that_appears_ends_the_motion_for_good(loop):
+    since = loop.start()
+    rival = loop.peer.node.create_publisher(Float64MultiArray, TOPIC, 1)
+    created = time.monotonic()
+    loop.peer.first_zeros(after=since)
+    loop.peer.all_zeros(after=since + loop.peer.first_zeros(after=since) - 1e-6)
+    assert time.monotonic() - created < 2.0
+    waits_because_of(loop, f"another publisher commands {TOPIC}: peer")
+    loop.peer.node.destroy_publisher(rival)
+    since = time.monotonic()
+    waits_because_of(loop, "no goal yet")
+    loop.peer.all_zeros(after=since, commands=40)
+    loop.peer.send_goal(*FAR)
+    loop.peer.moved(after=since)
+
+
+def test_nothing_moves_without_a_controller_that_listens(policy_path):
+    with free_domain() as domain:
+        peer = Peer(domain, listen_to_commands=False)
+        try:
+            with closed_loop(policy_path, peer=peer, goal=GOAL) as loop:
+                waits_because_of(loop, f"no controller listens to {TOPIC}")
+                assert peer.enable().message == f"no controller listens to {TOPIC}"
+                since = time.monotonic()
+                peer.listen(Float64MultiArray, TOPIC, peer.commands, 1000, lambda message: message.data.tolist())
+                wait_for(lambda: peer.enable().success, what="permission to move")
+                peer.moved(after=since)
+        finally:
+            peer.close()
+
+
+def test_a_controller_that_leaves_and_returns_stops_the_arm_in_between(policy_path):
+    with free_domain() as domain:
+        peer = Peer(domain, listen_to_commands=False)
+        try:
+            with closed_loop(policy_path, peer=peer, goal=GOAL) as loop:
+                for _ in range(2):
+                    listener = peer.listen(
+                        Float64MultiArray, TOPIC, peer.commands, 1000, lambda message: message.data.tolist()
+                    )
+                    peer.moved(after=time.monotonic())
+                    peer.node.destroy_subscription(listener)
+                    waits_because_of(loop, f"no controller listens to {TOPIC}")
+        finally:
+            peer.close()
+
+
+def test_it_drives_only_after_enable_unless_told_to_start_by_itself(policy_path):
+    with closed_loop(policy_path, autostart=False, goal=GOAL) as loop:
+        waits_because_of(loop, "not enabled")
+        assert loop.diagnosis()[2]["enabled"] == "False"
+        assert loop.peer.commands == []
+        wait_for(lambda: loop.peer.enable().success, what="permission to move")
+        loop.peer.moved()
+        since = time.monotonic()
+        answer = loop.peer.enable(False)
+        assert (answer.success, answer.message) == (True, "disabled: zero velocity")
+        assert loop.peer.first_zeros(after=since) < 0.05
+        loop.peer.all_zeros(after=since + 0.05, commands=30)
+        since = time.monotonic()
+        answer = loop.peer.enable()  # the goal is still there: who enables says go
+        assert (answer.success, answer.message) == (True, "enabled")
+        loop.peer.moved(after=since)
+
+
+def test_a_clock_of_a_simulation_that_stands_still_or_is_missing_changes_nothing(policy_path):
+    with closed_loop(policy_path, use_sim_time=True, goal=GOAL) as loop:
+        for clock in (None, 5, 5, 7):
+            if clock is not None:
+                loop.peer.publish("/clock", Clock(clock=Clock().clock.__class__(sec=clock)))
+            loop.peer.moved(after=time.monotonic(), commands=20)
+            since = loop.arm.pause()
+            assert loop.peer.first_zeros(after=since) < WITHIN
+            loop.peer.all_zeros(after=since + WITHIN)
+            loop.arm.go_home()

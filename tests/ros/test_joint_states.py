@@ -1,0 +1,193 @@
+"""Joint states as robots send them, good and bad: what the node makes of each."""
+
+import itertools
+import math
+import time
+
+import pytest
+from rclpy.qos import QoSProfile
+from sensor_msgs.msg import JointState
+
+from physai.ros import qos
+from tests.ros.loop import Arm, closed_loop
+from tests.ros.peer import wait_for
+
+WITHIN = 0.15  # s
+
+
+def spoilt(**fields):
+    """Make a change of messages: fields as functions of the message."""
+
+    def change(message):
+        for name, function in fields.items():
+            setattr(message, name, function(message))
+        return message
+
+    return change
+
+
+def reordered(message):
+    return JointState(
+        header=message.header,
+        name=["gripper", "joint2", "wheel", "joint1"],
+        position=[0.1, message.position[1], 7.0, message.position[0]],
+        velocity=[0.0, message.velocity[1], 9.0, message.velocity[0]],
+        effort=[1.0, 2.0, 3.0, 4.0],
+    )
+
+
+def wrapped(message):
+    message.position[0] = (message.position[0] + math.pi) % (2 * math.pi) - math.pi
+    return message
+
+
+def sometimes(change, period):
+    count = itertools.count(1)
+    return lambda message: change(message) if next(count) % period == 0 else message
+
+
+NAN_POSITION = spoilt(position=lambda message: [message.position[0], math.nan])
+REPEATED = []  # a stamp
+
+
+def repeated_stamp(message):
+    REPEATED.append((message.header.stamp.sec, message.header.stamp.nanosec))
+    message.header.stamp.sec, message.header.stamp.nanosec = REPEATED[0]
+    return message
+
+
+def backwards(message):
+    message.header.stamp.sec = 2_000_000_000 - message.header.stamp.sec  # int32
+    message.header.stamp.nanosec = 999_999_999 - message.header.stamp.nanosec
+    return message
+
+
+def long_ago(message):
+    message.header.stamp.sec -= 1_700_000_000
+    return message
+
+
+GOOD = {
+    "reordered, with joints of others": reordered,
+    "every fourth with NaN": sometimes(NAN_POSITION, 4),
+    "every other without a joint": sometimes(spoilt(name=lambda _: ["joint1", "joint3"]), 2),
+    "every third lost": sometimes(lambda message: None, 3),
+    "by a clock that is decades behind": long_ago,
+}
+BAD = {
+    "position not finite": NAN_POSITION,
+    "infinite position": spoilt(position=lambda message: [math.inf, message.position[1]]),
+    "joint missing": spoilt(name=lambda _: ["joint1", "joint3"]),
+    "one joint alone": lambda message: JointState(
+        header=message.header, name=["joint1"], position=message.position[:1], velocity=message.velocity[:1]
+    ),
+    "duplicate name": spoilt(name=lambda _: ["joint1", "joint2", "joint1"]),
+    "lengths disagree": spoilt(position=lambda message: message.position[:1]),
+    "velocity missing": spoilt(velocity=lambda _: []),
+    "velocity NaN": spoilt(velocity=lambda message: [message.velocity[0], math.nan]),
+    "velocity implausible": spoilt(velocity=lambda _: [0.0, 50.0]),
+    "stamp repeated": repeated_stamp,
+    "stamp backwards": backwards,
+    "nothing in it": lambda message: JointState(header=message.header),
+}
+COUNTED = {
+    "infinite position": "position not finite",
+    "one joint alone": "joint missing",
+    "velocity NaN": "velocity missing",
+    "nothing in it": "joint missing",
+}
+
+
+@pytest.mark.parametrize("change", GOOD.values(), ids=GOOD)
+def test_the_arm_moves_on(loop, change):
+    loop.rest()
+    loop.arm.change = change
+    since = loop.start_from_here()
+    wait_for(lambda: loop.peer.commands[-1][0] > since + 1.0)
+    assert all(any(velocity) for at, velocity in loop.peer.commands if at > since)
+    assert loop.peer.states[-1][1] == "active"
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_the_arm_stops_counts_and_goes_on_by_itself(loop, name):
+    loop.start()
+    counted = f"count: states rejected: {COUNTED.get(name, name)}"
+    before = int(loop.diagnosis(after=0.0)[2].get(counted, 0))
+    REPEATED.clear()
+    since = loop.arm.sent[-1]
+    loop.arm.change = BAD[name]
+    assert loop.peer.first_zeros(after=since) < WITHIN
+    loop.peer.all_zeros(after=since + WITHIN, commands=15)
+    loop.peer.wait_state("hold")
+    assert int(loop.diagnosis(after=since + WITHIN / 3)[2][counted]) > before
+    loop.arm.change = lambda message: message
+    since = time.monotonic()
+    loop.peer.moved(after=since)
+    assert loop.peer.wait_state("active")
+
+
+@pytest.mark.parametrize(
+    "change", [BAD["velocity missing"], BAD["velocity NaN"]], ids=["missing velocities", "NaN velocities"]
+)
+def test_are_estimated_where_that_is_allowed(loop, change):
+    loop.rest()
+    (answer,) = loop.peer.set_parameters("/inference_node", allow_velocity_estimate=True)
+    assert answer.successful, answer.reason
+    try:
+        loop.arm.change = change
+        since = loop.start_from_here()
+        wait_for(lambda: loop.peer.commands[-1][0] > since + 1.0)
+        assert all(any(velocity) for at, velocity in loop.peer.commands if at > since)
+    finally:
+        loop.peer.set_parameters("/inference_node", allow_velocity_estimate=False)
+
+
+@pytest.mark.parametrize(
+    "profile", [qos.SENSOR, QoSProfile(depth=10), qos.LATCHED], ids=["best effort", "reliable", "latched"]
+)
+def test_of_every_quality_of_service_are_heard(loop, profile):
+    loop.arm.leave()
+    loop.arm = Arm(loop.peer, profile)
+    since = loop.start()
+    loop.peer.moved(after=since, commands=30)
+
+
+def test_of_a_joint_that_counts_from_minus_pi_to_pi_lead_around_the_corner(policy_path):
+    with closed_loop(policy_path, max_velocity=1.0, limit_margin=0.2) as loop:
+        loop.arm.HOME = (-2.8, 0.8)
+        loop.arm.change = wrapped
+        loop.arm.position = [-2.8, 0.8]
+        loop.peer.wait_state("waiting", "hold")
+        loop.peer.send_goal(0.4 * math.cos(2.6), 0.4 * math.sin(2.6))
+        loop.peer.wait_state("reached")
+        assert loop.arm.position[0] < -math.pi
+        seen = [message.position[0] for _, message in loop.peer.joint_states]
+        assert max(seen) > 2.0
+        assert "holds: position jump" not in str(loop.diagnosis())
+
+
+def test_that_jump_stop_the_arm_until_they_agree(loop):
+    loop.start()
+    since = loop.arm.sent[-1]
+    loop.arm.position = [1.0, 0.5]
+    assert loop.peer.first_zeros(after=since) < 0.05
+    loop.peer.moved(after=since)
+    assert "position jump" in str(loop.diagnosis()[2])
+
+
+def test_of_an_arm_far_beyond_its_limit_are_a_fault_until_it_is_back_and_reset(loop):
+    loop.start()
+    loop.arm.position = [0.0, 2.85]
+    loop.peer.wait_state("fault")
+    level, message, _ = loop.diagnosis()
+    assert level == 2
+    assert "'joint2' is far beyond its position limit" in message
+    since = time.monotonic()
+    loop.peer.all_zeros(after=since)
+    loop.peer.call("/inference_node/reset")
+    loop.peer.all_zeros(after=since, commands=20)
+    assert loop.peer.states[-1][1] == "fault"  # it is still there
+    loop.arm.go_home()
+    loop.peer.all_zeros(after=since, commands=40)
+    assert loop.peer.states[-1][1] == "fault"
+    loop.start()

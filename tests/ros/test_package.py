@@ -1,0 +1,298 @@
+"""physai as a package of ROS: found, run and configured as `ros2 run` and `ros2 launch` do it (neither is on PyPI)."""
+
+import ast
+import dataclasses
+import importlib.util
+import math
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import sysconfig
+import venv as venv_module
+import zipfile
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
+from xml.etree import ElementTree
+
+import pytest
+import tomllib
+import yaml
+from hatchling.builders.wheel import WheelBuilder
+
+from physai.ros.command_watchdog import WatchdogConfig
+from physai.ros.commands import TOPIC
+from physai.ros.inference_node import InferenceConfig
+from physai.ros.record import RecordConfig
+from physai.ros.virtual_robot import VirtualRobotConfig
+from tests.ros.peer import wait_for
+
+REPOSITORY = Path(__file__).parents[2]
+PACKAGE = REPOSITORY / "physai" / "ros" / "package"
+NODES = {  # node: its executable, and its parameters
+    "inference_node": ("inference_node", InferenceConfig),
+    "command_watchdog": ("command_watchdog", WatchdogConfig),
+    "virtual_robot": ("virtual_robot", VirtualRobotConfig),
+    "recorder": ("record", RecordConfig),
+}
+EXECUTABLES = sorted(executable for executable, _ in NODES.values())
+
+
+def config_text() -> str:
+    """What config/physai.yaml says."""
+    lines = [
+        "# Every parameter of every node, with its default; fixed ones keep their value while a node runs.",
+        "# Lists that are empty by default are commented out, since ROS takes no empty lists.",
+    ]
+    for node, (_, kind) in NODES.items():
+        lines += [f"{node}:", "  ros__parameters:"]
+        for field in dataclasses.fields(kind):
+            unit, low, high, choices = (field.metadata[key] for key in ("unit", "low", "high", "choices"))
+            extent = " or ".join(choices)
+            if type(field.default) in (int, float):
+                extent = f"{low:g} to {high:g}" if math.isfinite(high) else f"from {low:g}"
+            notes = ", ".join(note for note in (unit, extent, "fixed" if field.metadata["fixed"] else "") if note)
+            comment = f"# {field.metadata['description']}" + (f" ({notes})" if notes else "")
+            if isinstance(field.default, tuple) and field.default:
+                lines += [f"    {field.name}:  {comment}", *(f"      - {item}" for item in field.default)]
+            elif isinstance(field.default, tuple):
+                lines.append(f"    # {field.name}: []  {comment}")
+            else:
+                value = yaml.safe_dump(field.default, default_flow_style=True).splitlines()[0]
+                lines.append(f"    {field.name}: {value}  {comment}")
+    return "\n".join(lines) + "\n"
+
+
+def test_the_config_file_is_what_the_nodes_have():
+    """After a change of parameters: python -m tests.ros.test_package."""
+    assert (PACKAGE / "config" / "physai.yaml").read_text() == config_text()
+    for node, (_, kind) in NODES.items():
+        values = yaml.safe_load(config_text())[node]["ros__parameters"]
+        assert kind(**values) == kind()
+
+
+@pytest.fixture(scope="session")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The wheel of this working tree."""
+    folder = tmp_path_factory.mktemp("wheel")
+    return Path(next(iter(WheelBuilder(str(REPOSITORY)).build(directory=str(folder), versions=["standard"]))))
+
+
+@pytest.fixture(scope="session")
+def venv(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A venv with the wheel, which borrows everything else from the venv of these tests."""
+    folder = tmp_path_factory.mktemp("venv")
+    venv_module.create(folder, symlinks=True)
+    [site] = folder.glob("lib/python*/site-packages")
+    borrowed = sysconfig.get_path("purelib")
+    (site / "borrowed.pth").write_text(f"import site; site.addsitedir({borrowed!r})\n")
+    install = ["install", "--quiet", "--no-deps", "--no-index", "--ignore-installed", str(wheel)]
+    subprocess.run([sys.executable, "-m", "pip", "--python", str(folder), *install], check=True)
+    return folder
+
+
+def environment(prefix: Path) -> dict[str, str]:
+    """Where ROS looks for packages; its own are those of the venv of these tests. PATH has another Python."""
+    return {**os.environ, "AMENT_PREFIX_PATH": f"{prefix}:{sys.prefix}", "PATH": "/usr/local/bin:/usr/bin:/bin"}
+
+
+def test_the_wheel_has_the_files_of_ros_once(wheel):
+    names = zipfile.ZipFile(wheel).namelist()
+    data = sorted(name.split(".data/data/")[1] for name in names if ".data/data/" in name)
+    assert data == [
+        *(f"lib/physai/{executable}" for executable in EXECUTABLES),
+        "share/ament_index/resource_index/packages/physai",
+        "share/physai/config/physai.yaml",
+        "share/physai/launch/arm.launch.py",
+        "share/physai/package.xml",
+    ]
+    assert "physai/ros/discovery.xml" in names
+    assert not [name for name in names if name.startswith("physai/ros/package")]
+
+
+def test_ros_finds_an_installed_wheel(venv):
+    found = subprocess.run(
+        [
+            venv / "bin" / "python",
+            "-c",
+            "from ament_index_python.packages import get_package_prefix, get_package_share_directory as share\n"
+            "import physai; print(get_package_prefix('physai'), share('physai'), physai.__file__)",
+        ],
+        env=environment(venv),
+        cwd=venv,  # not where the source is
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    prefix, share, module = map(Path, found.stdout.split())
+    assert prefix == venv
+    assert share == venv / "share" / "physai"
+    assert module.is_relative_to(venv)
+
+
+@pytest.mark.parametrize("executable", EXECUTABLES)
+def test_executables_run_in_their_venv(venv, executable):
+    path = venv / "lib" / "physai" / executable
+    shown = subprocess.run([path, "--help"], env=environment(venv), capture_output=True, text=True, check=True)
+    assert f"python -m physai.ros.{executable} --ros-args" in shown.stdout
+
+
+def test_executables_are_all_the_same():
+    assert sorted(path.name for path in (PACKAGE / "lib").iterdir()) == EXECUTABLES
+    assert len({(path.read_text(), path.stat().st_mode) for path in (PACKAGE / "lib").iterdir()}) == 1
+
+
+def test_nodes_take_the_config_file_without_a_warning(start, peer, tmp_path):
+    file = ["--params-file", str(PACKAGE / "config" / "physai.yaml")]
+    nodes = {
+        "virtual_robot": start("virtual_robot", *file),
+        "command_watchdog": start("command_watchdog", *file),
+        "recorder": start("record", *file, "-p", f"output:={tmp_path / 'bag'}"),
+    }
+    for name, process in nodes.items():
+        wait_for(lambda name=name: name in peer.node.get_node_names(), what=name)
+        process.signal(signal.SIGINT)
+        assert process.wait() == 0
+        assert "WARN" not in process.output
+        assert "ERROR" not in process.output
+
+
+class Launch(ModuleType):
+    """Stands in for ROS' launch, which is not on PyPI: it remembers what a launch file asks for."""
+
+    class DeclareLaunchArgument(SimpleNamespace):
+        def __init__(self, name: str, default_value: str | None = None, choices=None, description: str = "") -> None:
+            super().__init__(name=name, default=default_value, choices=choices, description=description)
+
+    class LaunchConfiguration(SimpleNamespace):
+        def __init__(self, name: str) -> None:
+            super().__init__(name=name)
+
+        def perform(self, context: dict[str, str]) -> str:
+            return context[self.name]
+
+    LaunchContext = dict
+    LaunchDescription = list
+    OpaqueFunction = Node = SimpleNamespace
+
+
+@pytest.fixture
+def launch_file(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    stub = Launch("launch")
+    for name in ("launch", "launch.actions", "launch.substitutions", "launch_ros", "launch_ros.actions"):
+        monkeypatch.setitem(sys.modules, name, stub)
+    monkeypatch.setattr("ament_index_python.packages.get_package_share_directory", lambda _: str(PACKAGE))
+    spec = importlib.util.spec_from_file_location("arm_launch", PACKAGE / "launch" / "arm.launch.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def launched(launch_file: ModuleType, tmp_path: Path, **given: str) -> list[list[str]]:
+    """Command lines of the nodes, as launch_ros makes them from a launch file."""
+    *arguments, function = launch_file.generate_launch_description()
+    context = {argument.name: given.pop(argument.name, argument.default) for argument in arguments}
+    assert not given
+    assert all(a.choices is None or context[a.name] in a.choices for a in arguments)
+    commands = []
+    for index, node in enumerate(function.function(context)):
+        assert node.package == "physai"
+        command = [str(PACKAGE / "lib" / node.executable), "--ros-args"]
+        for number, parameters in enumerate(node.parameters):
+            if isinstance(parameters, dict):
+                file = tmp_path / f"{index}_{number}.yaml"
+                file.write_text(yaml.safe_dump({"/**": {"ros__parameters": parameters}}))
+                parameters = file
+            command += ["--params-file", str(parameters)]
+        for old, new in getattr(node, "remappings", []):
+            command += ["-r", f"{old}:={new}"]
+        commands.append(command)
+    return commands
+
+
+def test_the_launch_file_names_what_there_is(launch_file):
+    assert launch_file.COMMANDS == TOPIC
+    assert f"{launch_file.SAFE_COMMANDS}" == "/command_watchdog/commands"
+    *arguments, _ = launch_file.generate_launch_description()
+    assert [argument.name for argument in arguments] == [
+        "policy_path",
+        "params_file",
+        "use_virtual_robot",
+        "use_watchdog",
+    ]
+    assert arguments[0].default is None  # required
+
+
+@pytest.mark.parametrize("use_watchdog", ["true", "false"])
+def test_the_launch_file_drives_the_virtual_robot(launch_file, start, peer, policy_path, tmp_path, use_watchdog):
+    parameters = tmp_path / "mine.yaml"
+    mine = {"max_velocity": 1.0, "limit_margin": 0.2, "autostart": True, "goal": [0.1, 0.4]}
+    parameters.write_text(yaml.safe_dump({"inference_node": {"ros__parameters": mine}}))
+    commands = launched(
+        launch_file,
+        tmp_path,
+        policy_path=str(policy_path),
+        params_file=str(parameters),
+        use_virtual_robot="true",
+        use_watchdog=use_watchdog,
+    )
+    assert len(commands) == (3 if use_watchdog == "true" else 2)
+    path = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
+    processes = [start.run(command, {"PATH": path}) for command in commands]
+    peer.wait_state("reached", timeout=60.0)
+    names = set(peer.node.get_node_names())
+    assert ("command_watchdog" in names) == (use_watchdog == "true")
+    publishers = {info.node_name for info in peer.node.get_publishers_info_by_topic(TOPIC)}
+    assert publishers == {"command_watchdog" if use_watchdog == "true" else "inference_node"}
+    assert all("WARN" not in line or "hold" in line for process in processes for line in process.lines)
+
+
+def test_package_xml_and_setup_py_agree_with_pyproject():
+    project = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["project"]
+    root = ElementTree.parse(PACKAGE / "package.xml").getroot()
+    setup = (PACKAGE / "setup.py").read_text()
+    assert root.attrib["format"] == "3"
+    for key in ("name", "version", "description", "license"):
+        assert root.findtext(key) == project[key]
+    assert f'version="{project["version"]}"' in setup
+    assert root.findtext("export/build_type") == "ament_python"
+
+
+def test_package_xml_names_every_package_of_ros_that_is_imported():
+    root = ElementTree.parse(PACKAGE / "package.xml").getroot()
+    named = {element.text for element in root.iter("exec_depend")}
+    imported = set()
+    for file in [*(REPOSITORY / "physai" / "ros").glob("*.py"), *(PACKAGE / "launch").glob("*.py")]:
+        for node in ast.walk(ast.parse(file.read_text())):
+            names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+            names += [node.module] if isinstance(node, ast.ImportFrom) and node.module else []
+            imported |= {name.split(".")[0] for name in names}
+    of_ros = {name for name in imported if name.endswith(("_msgs", "_srvs", "_interfaces"))}
+    of_ros |= imported & {"rclpy", "launch", "launch_ros", "ament_index_python"}
+    assert named == of_ros
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("options", [[], ["--symlink-install"]])
+def test_colcon_builds_it(options, tmp_path):
+    colcon = shutil.which("colcon")
+    if colcon is None:
+        pytest.skip("needs colcon: pip install colcon-common-extensions")
+    shutil.copytree(PACKAGE, tmp_path / "src" / "physai")
+    subprocess.run([colcon, "build", *options], cwd=tmp_path, check=True)
+    prefix = tmp_path / "install" / "physai"
+    for name in ("launch/arm.launch.py", "config/physai.yaml", "package.xml"):
+        assert (prefix / "share" / "physai" / name).exists()
+    assert (prefix / "share" / "ament_index" / "resource_index" / "packages" / "physai").exists()
+    path = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
+    for executable in EXECUTABLES:
+        command = [prefix / "lib" / "physai" / executable, "--help"]
+        shown = subprocess.run(command, env={**os.environ, "PATH": path}, capture_output=True, text=True, check=True)
+        assert f"physai.ros.{executable}" in shown.stdout
+
+
+if __name__ == "__main__":
+    (PACKAGE / "config" / "physai.yaml").write_text(config_text())

@@ -1,0 +1,288 @@
+"""One robot behind topics, as a physics engine: the virtual robot in its own process."""
+
+import gc
+import signal
+import sys
+import time
+
+import numpy as np
+import pytest
+from rcl_interfaces.srv import SetParameters
+from rclpy.parameter import Parameter
+from std_msgs.msg import Float64MultiArray
+
+from physai.errors import UserError
+from physai.physics import nominal_dynamics
+from physai.robots import RobotSpec
+from physai.ros import RosPhysics
+from physai.ros.commands import TOPIC
+from physai.ros.robot_link import RobotError
+from tests.ros.peer import wait_for
+
+DT = 0.02
+OPTIONS = {"homing_speed": 2.0, "state_timeout": 0.5, "reset_service": "/virtual_robot/reset", "remap": []}
+ROW = np.zeros(1, dtype=int)
+REST = np.zeros((1, 2))
+
+
+@pytest.fixture
+def spec(reacher):
+    return RobotSpec.from_config(reacher.robot)
+
+
+@pytest.fixture
+def connect(spec, domain, monkeypatch):
+    """Make a RosPhysics in the test's domain; it is closed after the test."""
+    monkeypatch.setenv("ROS_DOMAIN_ID", str(domain))
+    made = []
+
+    def connect(robots=1, **options):
+        made.append(RosPhysics(spec, robots, DT, 1, **{**OPTIONS, **options}))
+        return made[-1]
+
+    yield connect
+    for physics in made:
+        physics.close()
+
+
+def home(physics):
+    physics.reset(ROW, REST, REST)
+
+
+def move(physics, velocity, steps):
+    for _ in range(steps):
+        state = physics.step(np.array([velocity]))
+    return state
+
+
+def set_fault(peer, **values):
+    request = SetParameters.Request(parameters=[Parameter(k, value=v).to_parameter_msg() for k, v in values.items()])
+    answer = peer.call_service(SetParameters, "/virtual_robot/set_parameters", request)
+    assert all(result.successful for result in answer.results)
+
+
+def zeros_last(peer):
+    return peer.commands and not any(peer.commands[-1][1])
+
+
+def test_steps_take_a_control_period_and_do_not_drift(start, connect):
+    start("virtual_robot")
+    physics = connect()
+    home(physics)
+    times = [time.monotonic()]
+    for _ in range(150):
+        move(physics, [0.1, 0.1], 1)
+        times.append(time.monotonic())
+    periods = np.diff(times) * 1e3
+    print(f"periods: median {np.median(periods):.2f}, p99 {np.percentile(periods, 99):.2f}, max {periods.max():.2f} ms")
+    assert np.median(periods) == pytest.approx(20.0, abs=0.5)
+    assert periods.mean() == pytest.approx(20.0, abs=1.0)
+
+
+def test_a_caller_who_is_late_gets_whole_periods_again(start, connect):
+    start("virtual_robot")
+    physics = connect()
+    home(physics)
+    move(physics, [0.1, 0.1], 2)
+    time.sleep(0.07)  # on purpose: three periods and a half
+    for _ in range(3):
+        before = time.monotonic()
+        move(physics, [0.1, 0.1], 1)
+        assert time.monotonic() - before > 0.015
+
+
+def test_joints_are_mapped_by_name_and_others_ignored(start, connect):
+    start("virtual_robot", "-p", "state_joints:=[gripper, joint2, joint1]")
+    physics = connect()
+    home(physics)
+    q, qd = move(physics, [0.5, -0.25], 50)
+    assert q.shape == qd.shape == (1, 2)
+    np.testing.assert_allclose(q[0], [0.5, -0.25], atol=0.05)
+    np.testing.assert_allclose(qd[0], [0.5, -0.25], atol=0.02)
+
+
+def test_the_reset_service_puts_a_virtual_robot_home_at_once(start, connect):
+    start("virtual_robot")
+    physics = connect()
+    move(physics, [2.0, -2.0], 50)
+    before = time.monotonic()
+    home(physics)
+    assert time.monotonic() - before < 1.0  # driving 2 rad at 2 rad/s would take longer
+    np.testing.assert_allclose(physics.joint_state()[0], 0.0, atol=0.02)
+
+
+def test_a_robot_without_the_service_is_driven_home_and_stands_there(start, connect, peer):
+    start("virtual_robot", "-r", "__node:=arm")
+    physics = connect(homing_speed=1.0)
+    move(physics, [2.0, -1.0], 40)
+    since = time.monotonic()
+    home(physics)
+    q, qd = physics.joint_state()
+    assert np.abs(q).max() <= 0.02
+    np.testing.assert_allclose(qd, 0.0, atol=0.01)
+    sent = np.array([command for at, command in peer.commands if at > since + 0.1])
+    assert 0.9 < np.abs(sent).max() <= 1.0 + 1e-9
+    assert not sent[-1].any()
+
+
+def test_a_continuous_joint_goes_the_shorter_way_around(start, connect):
+    start("virtual_robot", "-r", "__node:=arm")
+    physics = connect()
+    physics.reset(ROW, np.array([[3.0, 0.0]]), REST)
+    physics.reset(ROW, np.array([[-3.0, 0.0]]), REST)
+    assert physics.joint_state()[0][0, 0] == pytest.approx(2 * np.pi - 3.0, abs=0.021)
+
+
+@pytest.mark.slow
+def test_an_arm_that_does_not_get_to_its_start_is_named(start, connect, peer):
+    start("virtual_robot", "-r", "__node:=arm", "-r", f"{TOPIC}:=/elsewhere")
+    physics = connect()
+    with pytest.raises(RobotError, match=r"does not get to its start: 0.500 rad off after \d s"):
+        physics.reset(ROW, np.array([[0.5, 0.0]]), REST)
+    wait_for(lambda: zeros_last(peer))
+
+
+def test_a_robot_that_falls_silent_is_stopped_and_can_be_used_again(start, connect, peer):
+    robot = start("virtual_robot")
+    physics = connect()
+    home(physics)
+    move(physics, [0.5, 0.5], 5)
+    robot.signal(signal.SIGSTOP)
+    before = time.monotonic()
+    with pytest.raises(RobotError, match=r"no joint state came on /joint_states within 0.5 s"):
+        move(physics, [0.5, 0.5], 10)
+    assert time.monotonic() - before < 1.5
+    wait_for(lambda: zeros_last(peer))
+    robot.signal(signal.SIGCONT)
+    home(physics)
+    q, _ = move(physics, [0.5, 0.5], 25)
+    np.testing.assert_allclose(q, 0.25, atol=0.05)
+
+
+@pytest.mark.parametrize(
+    ("fault", "healthy", "reason"),
+    [
+        ({"fault_nan": 1.0}, {"fault_nan": 0.0}, "a position or velocity is not finite"),
+        ({"fault_empty_velocity": True}, {"fault_empty_velocity": False}, "2 names, 2 positions and 0 velocities"),
+        ({"fault_stop": True}, {"fault_stop": False}, "within 0.5 s"),
+    ],
+)
+def test_states_that_cannot_be_used_end_in_zeros_and_an_error(start, connect, peer, fault, healthy, reason):
+    start("virtual_robot")
+    physics = connect()
+    move(physics, [0.5, 0.5], 5)
+    set_fault(peer, **fault)
+    with pytest.raises(RobotError, match=reason):
+        move(physics, [0.5, 0.5], 10)
+    wait_for(lambda: zeros_last(peer))
+    set_fault(peer, **healthy)
+    home(physics)
+    assert np.isfinite(move(physics, [0.5, 0.5], 2)).all()
+
+
+@pytest.mark.parametrize(
+    ("options", "reason"),
+    [
+        (["-p", "state_joints:=[joint1, joint3]"], "joint 'joint2' is missing"),
+        (["-r", f"{TOPIC}:=/elsewhere"], "no controller listens to /joint_velocity_controller/commands"),
+    ],
+)
+def test_a_robot_that_cannot_be_driven_is_refused(start, connect, options, reason):
+    robot = start("virtual_robot", *options)
+    robot.says("takes velocities")
+    with pytest.raises(RobotError, match=reason):
+        connect()
+
+
+def test_where_there_is_no_robot_one_line_says_so(connect):
+    with pytest.raises(RobotError, match=r"^no joint state came on /joint_states within 5 s$"):
+        connect()
+
+
+def test_a_robot_that_another_one_commands_is_left_alone(start, connect, peer):
+    start("virtual_robot")
+    peer.publisher(Float64MultiArray, TOPIC)
+    with pytest.raises(RobotError, match=f"another publisher commands {TOPIC}: peer"):
+        connect()
+    assert peer.commands == []
+
+
+def test_a_rival_who_comes_later_ends_the_episode_with_zeros(start, connect, peer):
+    start("virtual_robot")
+    physics = connect()
+    move(physics, [0.5, 0.5], 5)
+    rival = peer.publisher(Float64MultiArray, TOPIC)
+    with pytest.raises(RobotError, match="another publisher"):
+        move(physics, [0.5, 0.5], 200)
+    wait_for(lambda: zeros_last(peer))
+    peer.node.destroy_publisher(rival)
+    home(physics)
+    move(physics, [0.5, 0.5], 2)
+
+
+def test_an_arm_whose_caller_pauses_is_stopped(start, connect, peer):
+    start("virtual_robot")
+    physics = connect()
+    move(physics, [0.5, 0.5], 5)
+    paused = time.monotonic()
+    wait_for(lambda: zeros_last(peer))
+    assert peer.commands[-1][0] - paused < 0.5
+    move(physics, [0.5, 0.5], 5)
+
+
+def test_an_arm_whose_physics_is_forgotten_is_stopped(start, connect, spec, peer):
+    start("virtual_robot")
+    connect().close()  # it sets the domain
+    physics = RosPhysics(spec, 1, DT, 1, **OPTIONS)
+    move(physics, [0.5, 0.5], 5)
+    del physics
+    gc.collect()
+    wait_for(lambda: zeros_last(peer))
+    wait_for(lambda: peer.node.count_publishers(TOPIC) == 0, what="its publisher is gone")
+
+
+@pytest.mark.parametrize("end", ["", "raise RuntimeError('a bug')", "os.kill(os.getpid(), signal.SIGINT)"])
+def test_a_program_that_ends_in_any_way_leaves_a_standing_arm(start, peer, end):
+    start("virtual_robot")
+    script = f"""
+import os, signal
+import numpy as np, gymnasium, physai
+env = gymnasium.make("physai/RosReacher-v0")
+env.reset()
+for _ in range(10):
+    env.step(np.ones(2, np.float32))
+{end}
+"""
+    program = start.run([sys.executable, "-c", script])
+    wait_for(lambda: any(any(command) for _, command in peer.commands), 60.0, "a command")
+    program.wait()
+    wait_for(lambda: zeros_last(peer))
+    assert [any(command) for _, command in peer.commands[-3:]] == [False] * 3, program.output
+
+
+def test_what_a_robot_behind_ros_cannot_do_is_refused_in_one_line(start, connect, spec, peer):
+    with pytest.raises(UserError, match="there is one robot behind ROS, not 2"):
+        connect(robots=2)
+    with pytest.raises(UserError, match=r"homing_speed: 9.0 rad/s is beyond the limit of 'planar_arm', 2.5 rad/s"):
+        connect(homing_speed=9.0)
+    start("virtual_robot")
+    physics = connect()
+    with pytest.raises(UserError, match=r"cannot be set; choose randomization=none"):
+        physics.reset(ROW, REST, REST, nominal_dynamics(spec))
+    with pytest.raises(UserError, match="starts from rest"):
+        physics.reset(ROW, REST, REST + 1.0)
+    with pytest.raises(UserError, match="must be finite"):
+        physics.step(np.array([[0.5, np.nan]]))
+    for question in (physics.state, physics.parameters):
+        with pytest.raises(UserError, match="robot behind ROS"):
+            question()
+    assert not any(any(command) for _, command in peer.commands)
+    physics.close()
+    physics.close()
+
+
+def test_topics_can_have_other_names(start, connect):
+    start("virtual_robot", "-r", "/joint_states:=/left/joint_states", "-r", f"{TOPIC}:=/left/commands")
+    physics = connect(remap=["/joint_states:=/left/joint_states", f"{TOPIC}:=/left/commands"])
+    q, _ = move(physics, [0.5, 0.5], 25)
+    np.testing.assert_allclose(q, 0.25, atol=0.05)

@@ -1,0 +1,67 @@
+"""Whatever ends the inference node while the arm moves: the last command is zero."""
+
+import contextlib
+import signal
+import time
+
+import pytest
+
+from tests.ros.loop import closed_loop
+from tests.ros.peer import TOPIC, Peer, wait_for
+
+GOAL = "[-0.3, -0.2]"
+ENDS = {
+    "SIGINT": lambda loop: loop.node.signal(signal.SIGINT),
+    "SIGINT, twice": lambda loop: [(loop.node.signal(signal.SIGINT), time.sleep(0.03)) for _ in range(2)],
+    "SIGHUP": lambda loop: loop.node.signal(signal.SIGHUP),
+    "the service": lambda loop: loop.peer.call("/inference_node/shutdown"),
+}
+
+
+def leaves_the_arm_standing(peer: Peer) -> None:
+    """See that the commands end with zeros that came to a moving arm."""
+    wait_for(lambda: not peer.node.count_publishers(TOPIC), what="an end of the publisher")
+    peer.silent()
+    commands = [velocity for _, velocity in peer.commands]
+    assert any(map(any, commands[-30:])), f"the arm did not move at the end: {commands[-30:]}"
+    assert commands[-5:] == [[0.0, 0.0]] * 5
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("batch", range(4))
+@pytest.mark.parametrize(
+    ("end", "code"), [(signal.SIGINT, 0), (signal.SIGTERM, 0), ("exception", 1)], ids=["SIGINT", "SIGTERM", "exception"]
+)
+def test_the_last_command_is_zero_five_times_of_five(policy_path, end, code, batch):
+    raising = end == "exception"
+    module = "tests.ros.raising_node" if raising else "inference_node"
+    with contextlib.ExitStack() as stack:
+        loops = [stack.enter_context(closed_loop(policy_path, rate=50.0, module=module, goal=GOAL)) for _ in range(5)]
+        for loop in loops:
+            loop.peer.moved()
+            if not raising:  # the controller does it by itself
+                loop.node.signal(end)
+        for loop in loops:
+            assert loop.node.wait() == code, loop.node.output
+            leaves_the_arm_standing(loop.peer)
+            assert loop.node.output.count("Traceback") == code
+
+
+@pytest.mark.parametrize("end", ENDS.values(), ids=ENDS)
+def test_the_last_command_is_zero(policy_path, end):
+    with closed_loop(policy_path, goal=GOAL) as loop:
+        loop.peer.moved()
+        end(loop)
+        assert loop.node.wait() == 0, loop.node.output
+        leaves_the_arm_standing(loop.peer)
+        assert "Traceback" not in loop.node.output
+
+
+def test_a_node_that_never_had_a_say_ends_without_a_word(policy_path):
+    with closed_loop(policy_path, autostart=False, goal=GOAL) as loop:
+        loop.peer.wait_state("waiting")
+        wait_for(lambda: len(loop.arm.sent) > 50)
+        loop.node.signal(signal.SIGTERM)
+        assert loop.node.wait() == 0
+        loop.peer.silent()
+        assert loop.peer.commands == []

@@ -1,0 +1,105 @@
+"""The virtual robot's controller and arm, without ROS."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from physai.errors import UserError
+from physai.ros.virtual_arm import VelocityController, VirtualArm
+
+WILD = st.floats() | st.just(math.nan)
+
+
+def test_the_last_velocity_holds_for_ever():
+    controller = VelocityController(2)
+    assert controller.velocity(0.0).tolist() == [0.0, 0.0]
+    controller.command([0.1, -0.2], 1.0)
+    assert controller.velocity(1e9).tolist() == [0.1, -0.2]
+
+
+def test_with_a_timeout_it_ends_until_the_next_command():
+    controller = VelocityController(1, timeout=0.5)
+    controller.command([0.1], 1.0)
+    assert controller.velocity(1.5).tolist() == [0.1]
+    assert controller.velocity(1.51).tolist() == [0.0]
+    controller.command([0.2], 2.0)
+    assert controller.velocity(2.1).tolist() == [0.2]
+    controller.timeout = 0.0
+    assert controller.velocity(1e9).tolist() == [0.2]
+
+
+def test_a_dropped_command_does_not_prolong_the_last():
+    controller = VelocityController(1, timeout=0.5)
+    controller.command([0.1], 1.0)
+    controller.command([math.nan], 1.4)
+    assert controller.velocity(1.6).tolist() == [0.0]
+
+
+@given(st.lists(st.lists(WILD, max_size=4), max_size=20))
+def test_it_does_what_the_real_one_does_with_every_sequence_of_commands(commands):
+    controller = VelocityController(2)
+    expected, active = [0.0, 0.0], True
+    for now, command in enumerate(commands):
+        controller.command(command, float(now))
+        if active and len(command) != 2:
+            expected, active = [0.0, 0.0], False
+        elif active and all(map(math.isfinite, command)):
+            expected = command
+        assert controller.velocity(float(now)).tolist() == expected
+        assert controller.active == active
+    controller.activate()
+    assert controller.velocity(0.0).tolist() == [0.0, 0.0]
+    controller.command([1.0, 2.0], 0.0)
+    assert controller.velocity(0.0).tolist() == [1.0, 2.0]
+
+
+def test_a_command_is_copied():
+    controller, command = VelocityController(1), np.array([0.1])
+    controller.command(command, 0.0)
+    command[:] = 5.0
+    assert controller.velocity(0.0).tolist() == [0.1]
+
+
+def path(randomization: str, seed: int) -> np.ndarray:
+    arm = VirtualArm("reacher", randomization, seed, 0.01)
+    try:
+        return np.array([arm.step(np.array([0.5, -0.3]))[0] for _ in range(50)])
+    finally:
+        arm.close()
+
+
+def test_the_ideal_arm_moves_as_told_from_home():
+    steps = path("none", 0)
+    # It accelerates for a moment.
+    assert np.allclose(steps[-1] - steps[-11], [0.05, -0.03], atol=2e-3)
+    np.testing.assert_array_equal(steps, path("none", 1))  # there is nothing to draw
+
+
+def test_randomization_makes_other_arms_the_same_for_the_same_seed():
+    one, ideal = path("strong", 0), path("none", 0)
+    np.testing.assert_array_equal(one, path("strong", 0))
+    assert np.abs(one - ideal).max() > 1e-3
+    assert np.abs(one - path("strong", 1)).max() > 1e-3
+
+
+def test_reset_brings_it_home():
+    arm = VirtualArm("reacher", "none", 0, 0.01)
+    try:
+        home, _ = arm.step(np.zeros(2))
+        for _ in range(20):
+            arm.step(np.ones(2))
+        arm.reset()
+        position, velocity = arm.step(np.zeros(2))
+        np.testing.assert_allclose(position, home, atol=1e-9)
+        np.testing.assert_allclose(velocity, 0.0, atol=1e-9)
+    finally:
+        arm.close()
+
+
+@pytest.mark.parametrize(("env", "randomization"), [("nobody", "none"), ("reacher", "nothing")])
+def test_an_unknown_config_is_named(env, randomization):
+    with pytest.raises(UserError, match=r"nobody|nothing"):
+        VirtualArm(env, randomization, 0, 0.01)
