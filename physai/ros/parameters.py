@@ -24,7 +24,7 @@ def declare(node: Node, kind: type[P], apply: Callable[[P], None]) -> P:
     together, and all are refused if one is wrong.
 
     Args:
-        node: Made with ``automatically_declare_parameters_from_overrides=True``.
+        node: Its parameters are declared here.
         kind: The dataclass; its fields are those of :func:`physai.deploy.parameters.parameter`.
         apply: Takes new values while the node runs; may raise a UserError, and then must change nothing.
 
@@ -33,10 +33,11 @@ def declare(node: Node, kind: type[P], apply: Callable[[P], None]) -> P:
     """
     fields = {field.name: field for field in dataclasses.fields(kind)}
     given = {}
-    for name, found in node.get_parameters_by_prefix("").items():
+    # Private, but rclpy's own way to hand them out declares them, and fails at an empty list.
+    for name, found in node._parameter_overrides.items():
         if name in fields:
-            given[name] = _plain(found)
-            node.undeclare_parameter(name)
+            empty = found.type_ is Parameter.Type.NOT_SET and isinstance(fields[name].default, tuple)
+            given[name] = () if empty else _plain(found)
         elif not name.startswith(_OF_ROS):
             close = difflib.get_close_matches(name, fields, n=1, cutoff=0.6)
             hint = f"; did you mean '{close[0]}'?" if close else ""

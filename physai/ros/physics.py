@@ -1,6 +1,7 @@
 """A robot behind ROS topics where a physics engine is expected: the same task, on what moves by itself."""
 
 import math
+import os
 import time
 import weakref
 from typing import Annotated
@@ -20,11 +21,15 @@ _SILENCE = 0.1  # s, or two periods: a caller who pauses for longer does not loo
 _GAIN = 5.0  # 1/s; homing slows down in the last homing_speed / _GAIN rad
 
 
+_in_charge: dict[tuple[str, ...], "weakref.ref[RosPhysics]"] = {}  # of each robot that this process has to do with
+
+
 class RosPhysics:
     """One robot, simulated or real, in real time; the interface is :class:`physai.physics.Physics`.
 
     Commands are passed on as they are: limits are the robot's own. Whatever goes wrong ends with zero velocity, and so
-    does a pause of the caller. No observation is ever made up: without a fresh joint state there is an error.
+    does a pause of the caller. No observation is ever made up: without a fresh joint state there is an error. There is
+    one robot: another of these in the same process takes it over, and closes the one before.
 
     Args:
         spec: The robot; commands are in the order of its joints, joint states are mapped by name.
@@ -61,6 +66,9 @@ class RosPhysics:
                 f"{spec.velocity_limit.min():g} rad/s"
             )
         self.num_robots = num_robots
+        robot = (os.environ.get("ROS_DOMAIN_ID", "0"), *sorted(remap))
+        if (before := _in_charge.get(robot, lambda: None)()) is not None:
+            before.close()
         self._continuous = spec.continuous
         self._dt, self._speed, self._timeout = control_dt, homing_speed, state_timeout
         self._link = RobotLink(spec.joints, max(_SILENCE, 2 * control_dt), reset_service, remap)
@@ -72,6 +80,7 @@ class RosPhysics:
             self.close()
             raise
         self._deadline = -math.inf
+        _in_charge[robot] = weakref.ref(self)
 
     def reset(
         self,
@@ -92,6 +101,7 @@ class RosPhysics:
             raise UserError("a robot behind ROS starts from rest")
         if not len(rows):
             return
+        self._check_open()
         self._link.wait_ready()
         after = self._link.stop()
         if self._link.reset():
@@ -126,6 +136,7 @@ class RosPhysics:
             UserError: If the command is not finite.
             RobotError: If another publisher commands the robot, nobody listens, or no joint state comes.
         """
+        self._check_open()
         try:
             if not np.isfinite(velocity_command).all():
                 raise UserError(f"a velocity command must be finite, got {velocity_command.tolist()}")
@@ -157,6 +168,10 @@ class RosPhysics:
     def set_state(self, state: dict[str, np.ndarray]) -> None:
         """Not possible."""
         self.state()
+
+    def _check_open(self) -> None:
+        if not self._finalizer.alive:
+            raise RobotError("this env is closed, or another one of this process has taken its robot over")
 
     def close(self) -> None:
         """Stop the robot, surely; may be called twice."""

@@ -33,9 +33,6 @@ class StoppableNode(Node):
 
     stopped = False
 
-    def __init__(self, name: str) -> None:
-        super().__init__(name, automatically_declare_parameters_from_overrides=True)
-
     @abstractmethod
     def finish(self) -> None:
         """Leave the robot standing, or the file complete; no callback comes after it."""
@@ -97,6 +94,9 @@ def _run(make_node: Callable[[], StoppableNode], caught: list[int]) -> int:
             executor.spin_once(timeout_sec=0.1)
         log.info(f"{signal.Signals(caught[0]).name if caught else 'a request'} ends this node")
         return 0
+    except UserError as error:
+        log.fatal(str(error))
+        return 2
     except Exception as error:
         log.fatal(f"{type(error).__name__} ends this node: {error}\n{traceback.format_exc()}")
         return 1

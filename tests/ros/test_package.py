@@ -43,7 +43,6 @@ def config_text() -> str:
     """What config/physai.yaml says."""
     lines = [
         "# Every parameter of every node, with its default; fixed ones keep their value while a node runs.",
-        "# Lists that are empty by default are commented out, since ROS takes no empty lists.",
     ]
     for node, (_, kind) in NODES.items():
         lines += [f"{node}:", "  ros__parameters:"]
@@ -57,7 +56,7 @@ def config_text() -> str:
             if isinstance(field.default, tuple) and field.default:
                 lines += [f"    {field.name}:  {comment}", *(f"      - {item}" for item in field.default)]
             elif isinstance(field.default, tuple):
-                lines.append(f"    # {field.name}: []  {comment}")
+                lines.append(f"    {field.name}: []  {comment}")
             else:
                 value = yaml.safe_dump(field.default, default_flow_style=True).splitlines()[0]
                 lines.append(f"    {field.name}: {value}  {comment}")

@@ -49,7 +49,6 @@ def create(context, apply=None, **overrides):
         "example",
         context=context,
         parameter_overrides=[Parameter(name, value=value) for name, value in overrides.items()],
-        automatically_declare_parameters_from_overrides=True,
         enable_rosout=False,
     )
     changes = []
@@ -198,3 +197,8 @@ def test_bad_and_fixed_values_are_refused_while_the_arm_moves_and_change_nothing
     assert answer.successful, answer.reason
     (answer,) = loop.peer.set_parameters(NODE, max_velocity=0.3)
     assert answer.successful, answer.reason
+
+
+def test_an_empty_list_of_the_command_line_is_the_empty_list(domain, start):
+    node = start("virtual_robot", joints="[]", fault_nan=1)
+    node.says("takes velocities of ['joint1', 'joint2']")
