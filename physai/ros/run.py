@@ -21,7 +21,8 @@ from physai.errors import UserError
 from physai.ros.parameters import help_text
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-_PROFILES = ("FASTDDS_DEFAULT_PROFILES_FILE", "FASTRTPS_DEFAULT_PROFILES_FILE")
+# Jazzy's Fast DDS (2.14) reads the first, later ones the second.
+_PROFILES = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")
 
 
 class StoppableNode(Node):
@@ -76,9 +77,10 @@ def run(make_node: Callable[[], StoppableNode], module: str, about: str, kind: t
 
 
 def prepare_middleware() -> None:
-    """Let nodes find each other, and miss each other, quickly; a profile of the user's own stays."""
+    """Have Fast DDS find and miss nodes quickly, and use UDP alone (see fastdds.xml); the user's own settings stay."""
     if not any(name in os.environ for name in _PROFILES):
-        os.environ[_PROFILES[0]] = str(files("physai.ros") / "discovery.xml")
+        os.environ.update(dict.fromkeys(_PROFILES, str(files("physai.ros") / "fastdds.xml")))
+    os.environ.setdefault("FASTDDS_BUILTIN_TRANSPORTS", "UDPv4")  # beyond LOCALHOST, where ROS chooses for itself
 
 
 def _run(make_node: Callable[[], StoppableNode], caught: list[int]) -> int:

@@ -1,7 +1,6 @@
 """Processes that stand still or die: robot, node, and what is left to stop the arm."""
 
 import signal
-import statistics
 import time
 
 import pytest
@@ -10,9 +9,6 @@ from tests.ros.loop import FAR, closed_loop
 from tests.ros.peer import wait_for
 
 WITHIN = 0.15  # s
-# Fast DDS' shared memory: whoever publishes to a process that was stopped or killed inside a critical section waits for
-# its lock for about a second (measured: 1 stop of 20; never without shared memory).
-LOCK = 1.5  # s
 
 
 @pytest.fixture
@@ -39,7 +35,7 @@ def speeds(peer, after):
 def test_a_robot_that_stands_still_and_one_that_dies(driven, start, peer):
     robot, _ = driven()
     took = []
-    for _ in range(7):
+    for _ in range(10):
         robot.signal(signal.SIGSTOP)
         since = time.monotonic()
         took.append(peer.first_zeros(after=since))
@@ -48,12 +44,11 @@ def test_a_robot_that_stands_still_and_one_that_dies(driven, start, peer):
         robot.signal(signal.SIGCONT)  # it goes on by itself
         peer.wait_state("active", after=since)
         peer.moved(after=time.monotonic())
-    assert statistics.median(took) < WITHIN, took
-    assert max(took) < WITHIN + LOCK, took
+    assert max(took) < WITHIN, took
     robot.signal(signal.SIGKILL)
     since = time.monotonic()
     delay = peer.first_zeros(after=since)
-    assert delay < WITHIN + LOCK
+    assert delay < WITHIN
     peer.all_zeros(after=since + delay, commands=20)
     start("virtual_robot")  # at home, not where the other one died
     peer.wait_state("active", after=since)
@@ -106,7 +101,7 @@ def test_a_robot_with_a_command_timeout_stops_without_its_node(driven, peer):
     since = time.monotonic()
     last = peer.commands[-1][0]
     stands = wait_for(lambda: next((at for at, speed in speeds(peer, since) if speed < 1e-3), None), 5.0)
-    assert 0.15 < stands - last < 0.3 + LOCK
+    assert 0.15 < stands - last < 0.3
 
 
 def test_a_paused_robot_of_this_process_stops_the_arm_within_the_timeout(policy_path):

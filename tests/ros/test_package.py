@@ -106,7 +106,7 @@ def test_the_wheel_has_the_files_of_ros_once(wheel):
         "share/physai/launch/arm.launch.py",
         "share/physai/package.xml",
     ]
-    assert "physai/ros/discovery.xml" in names
+    assert "physai/ros/fastdds.xml" in names
     assert not [name for name in names if name.startswith("physai/ros/package")]
 
 
