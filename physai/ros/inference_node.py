@@ -103,11 +103,8 @@ class InferenceNode(StoppableNode):
     # What comes in
 
     def _take_joint_state(self, message: JointStateMessage, info: dict[str, int]) -> None:
-        # It may have waited for this thread: what counts is when it came to this computer.
-        arrived = info["received_timestamp"]
-        waited = max(0.0, (time.time_ns() - arrived) * 1e-9) if arrived else 0.0
         stamp = message.header.stamp.sec + message.header.stamp.nanosec * 1e-9
-        received = time.monotonic() - waited
+        received = qos.received_at(info)
         self._joint_state = JointState(message.name, message.position, message.velocity, stamp, received)
         if self.config.trigger == "joint_state":
             self._tick()

@@ -1,4 +1,6 @@
-"""Qualities of service, and why (REP-2003 and the QoS pages of ROS 2 Jazzy name the policies)."""
+"""How messages travel: qualities of service, and why (REP-2003 names the policies); and when one has come."""
+
+import time
 
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
@@ -13,3 +15,14 @@ LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 EMERGENCY = (SENSOR, COMMAND, LATCHED)
 """Three subscriptions, so that a message is heard from every kind of publisher, also one that was sent before."""
+
+
+def received_at(info: dict[str, int]) -> float:
+    """When a message came to this computer, s on ``time.monotonic``: it may have waited for the thread that asks.
+
+    Args:
+        info: What rclpy gives to callbacks that take two arguments.
+    """
+    arrived = info["received_timestamp"]  # ns since 1970; 0 from middlewares that do not say
+    waited = max(0.0, (time.time_ns() - arrived) * 1e-9) if arrived else 0.0
+    return time.monotonic() - waited

@@ -23,7 +23,7 @@ from physai.deploy.parameters import Parameters, parameter
 from physai.errors import UserError
 from physai.ros.bag import TYPES, Bag, recover
 from physai.ros.parameters import declare
-from physai.ros.run import StoppableNode, run
+from physai.ros.run import StoppableNode, brief, run
 
 TOPICS = (
     "/joint_states",
@@ -204,7 +204,7 @@ def _resolve(node: StoppableNode, topics: tuple[str, ...]) -> list[str]:
     try:
         return list(dict.fromkeys(node.resolve_topic_name(topic) for topic in topics))
     except RuntimeError as error:  # RCLError
-        raise UserError(f"topics: {str(error).splitlines()[0].split(', at /')[0]}") from None
+        raise UserError(f"topics: {brief(error)}") from None
 
 
 def _to_bag(offered: QoSProfile) -> Qos:

@@ -19,7 +19,7 @@ from std_srvs.srv import Trigger
 from physai.errors import UserError
 from physai.ros import qos
 from physai.ros.commands import VelocityCommands
-from physai.ros.run import prepare_middleware
+from physai.ros.run import brief, prepare_middleware
 
 _DISCOVERY = 0.5  # s until all rivals are known; the slowest that was measured took 0.4
 _PATIENCE = 5.0  # s; for a robot to appear, a rival to leave, a service to answer
@@ -58,7 +58,7 @@ class RobotLink:
                 signal_handler_options=SignalHandlerOptions.NO,
             )
         except RuntimeError as error:  # RCLError
-            raise UserError(str(error).splitlines()[0].split(", at /")[0]) from None
+            raise UserError(brief(error)) from None
         self._node = Node("physai_env", context=self._context, start_parameter_services=False, enable_rosout=False)
         self._news = threading.Condition()  # also guards what goes out
         self._received, self._stamp, self._refused = -math.inf, -1, ""
@@ -84,10 +84,7 @@ class RobotLink:
             self._executor.spin()
 
     def _take(self, message: JointState, info: dict[str, int]) -> None:
-        # It may have waited for this thread: what counts is when it came to this computer.
-        arrived = info["received_timestamp"]
-        waited = max(0.0, (time.time_ns() - arrived) * 1e-9) if arrived else 0.0
-        received = time.monotonic() - waited
+        received = qos.received_at(info)
         stamp = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
         state = _read(message, self._joints)
         with self._news:

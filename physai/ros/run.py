@@ -62,14 +62,14 @@ def run(make_node: Callable[[], StoppableNode], module: str, about: str, kind: t
     try:
         arguments = remove_ros_args(sys.argv)[1:]
     except RuntimeError as error:  # RCLError: such as a file of parameters that does not exist
-        return _refuse(_brief(error))
+        return _refuse(brief(error))
     parser.parse_args(arguments)
     prepare_middleware()
     with _signals() as caught:
         try:
             rclpy.init(args=sys.argv, signal_handler_options=SignalHandlerOptions.NO)
         except RuntimeError as error:  # RCLError
-            return _refuse(_brief(error))
+            return _refuse(brief(error))
         try:
             return _run(make_node, caught)
         finally:
@@ -120,7 +120,7 @@ def _signals() -> Iterator[list[int]]:
             signal.signal(number, handler)
 
 
-def _brief(error: Exception) -> str:
+def brief(error: Exception) -> str:
     """What ROS says, without its lines of source code."""
     return str(error).splitlines()[0].split(", at /")[0]
 
