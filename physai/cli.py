@@ -20,6 +20,8 @@ from omegaconf.errors import OmegaConfBaseException
 from physai.config import compose, conf_dir
 from physai.errors import UserError
 
+_SIGNALS = (signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)
+
 Job = Callable[[DictConfig, Path], object]
 
 
@@ -35,7 +37,8 @@ def main(name: str, job: Job, check: Callable[[DictConfig], object]) -> None:
     if set(flags) <= {"-m", "--multirun"}:
         with guard():
             sys.argv += _check_all(name, check, overrides(), sweep=bool(flags))
-    hydra.main(version_base="1.3", config_path=str(conf_dir().absolute()), config_name=name)(_guarded(job))()
+    with guard():
+        hydra.main(version_base="1.3", config_path=str(conf_dir().absolute()), config_name=name)(_guarded(job))()
 
 
 def overrides() -> list[str]:
@@ -46,14 +49,15 @@ def overrides() -> list[str]:
 class guard:  # noqa: N801
     """Context in which what a user or a disk does wrong ends in one line and exit code 2, and Ctrl-C in 130.
 
-    SIGTERM ends it like Ctrl-C, so that a robot is not left moving.
+    Other signals end it like Ctrl-C, so that a robot is not left moving.
     """
 
     def __enter__(self) -> None:
-        self._before = signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
+        self._before = {number: signal.signal(number, lambda number, _: sys.exit(128 + number)) for number in _SIGNALS}
 
     def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
-        signal.signal(signal.SIGTERM, self._before)
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
         if isinstance(error, UserError):
             print(f"error: {error}", file=sys.stderr)
             sys.exit(2)

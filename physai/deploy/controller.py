@@ -320,6 +320,20 @@ class Controller:
         return self._zeros
 
 
+def smallest_margin(max_velocity: float, state_timeout: float, period: float) -> float:
+    """What the arm may travel until an old joint state stops it, and an update that is just not late sees that.
+
+    Args:
+        max_velocity: rad/s.
+        state_timeout: s.
+        period: Between updates, s.
+
+    Returns:
+        rad, rounded up to a thousandth.
+    """
+    return math.ceil(max_velocity * (state_timeout + _LATE * period) * 1e3 - 1e-6) / 1e3
+
+
 def _last_line(error: Exception) -> str:
     """What went wrong; TorchScript's errors begin with a traceback."""
     return (str(error).strip().splitlines() or ["no reason given"])[-1][:80]
@@ -334,10 +348,9 @@ def _check(config: ControllerConfig, metadata: Metadata, period: float) -> None:
     span = (metadata.position_limit[:, 1] - metadata.position_limit[:, 0]).min()
     if 2 * config.limit_margin >= span:
         raise UserError(f"limit_margin: {config.limit_margin} rad leaves no room between the position limits")
-    # What the arm may travel until an old joint state stops it, and an update that is just not late sees that.
-    blind = config.max_velocity * (config.state_timeout + _LATE * period)
+    blind = smallest_margin(config.max_velocity, config.state_timeout, period)
     if np.isfinite(metadata.position_limit).any() and blind > config.limit_margin + 1e-9:
         raise UserError(
             f"limit_margin: at {config.max_velocity} rad/s and a state_timeout of {config.state_timeout} s it must be "
-            f"{math.ceil(blind * 1e3 - 1e-6) / 1e3:.3f} rad at least, got {config.limit_margin}"
+            f"{blind:.3f} rad at least, got {config.limit_margin}"
         )

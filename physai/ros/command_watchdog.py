@@ -1,8 +1,9 @@
 """A relay before a controller that has no timeout: when commands stop, it goes on with zeros.
 
 The inference node publishes to ~/commands (remap its /joint_velocity_controller/commands to
-/command_watchdog/commands); this node passes commands on, and zeros when none has come for a while or another publisher
-commands the controller. Run it on the robot's side of whatever may fail.
+/command_watchdog/commands); this node passes commands on. It sends zeros when none has come for a while, and, until
+~/reset, when another publisher has commanded the controller. It listens only while a controller listens to it, so that
+who commands it knows. Run it on the robot's side of whatever may fail.
 """
 
 import math
@@ -11,7 +12,9 @@ import time
 from dataclasses import dataclass
 
 from rclpy.clock import Clock, ClockType
+from rclpy.subscription import Subscription
 from std_msgs.msg import Float64MultiArray
+from std_srvs.srv import Trigger
 
 from physai.deploy.parameters import Parameters, parameter
 from physai.ros import qos
@@ -26,6 +29,9 @@ class WatchdogConfig(Parameters):
 
     timeout: float = parameter(0.1, "without a command for this long, the arm stops", "s", 0.01, 10.0)
     rate_hz: float = parameter(50.0, "zeros per second", "Hz", 1.0, 1000.0, fixed=True)
+    joints: int = parameter(
+        0, "velocities in a command: zeros come from the start; 0: from the first command on", "", 0, 1000, fixed=True
+    )
 
 
 class CommandWatchdog(StoppableNode):
@@ -33,29 +39,36 @@ class CommandWatchdog(StoppableNode):
 
     def __init__(self) -> None:
         super().__init__("command_watchdog")
-        self._config = declare(self, WatchdogConfig, self._configure)
-        self._commands: VelocityCommands | None = None  # until the first command tells how many joints there are
-        self._joints = 0
+        self._config = config = declare(self, WatchdogConfig, self._configure)
+        self._commands = VelocityCommands(self, config.joints)
+        self._joints = config.joints
+        self._source: Subscription | None = None
         self._last = -math.inf
+        self._looked = time.monotonic()
+        self._deaf_until = -math.inf
+        self._conflict = ""
         self._reason = ""
-        self.create_subscription(Float64MultiArray, "~/commands", self._relay, qos.COMMAND)
-        self.create_timer(1.0 / self._config.rate_hz, self._check, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self.create_service(Trigger, "~/reset", self._reset)
+        self.create_timer(1.0 / config.rate_hz, self._check, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def _configure(self, config: WatchdogConfig) -> None:
         self._config = config
 
     def _relay(self, message: Float64MultiArray) -> None:
+        self._look()
         velocity = message.data.tolist()
-        if self._commands is None:
+        sound = len(velocity) > 0 and all(map(math.isfinite, velocity))
+        if not self._joints and sound:
             self._joints = len(velocity)
-            self._commands = VelocityCommands(self, self._joints)
-        self._last = time.monotonic()
-        if len(velocity) != self._joints:
-            self._stop(f"{len(velocity)} velocities for {self._joints} joints")
-        elif not all(map(math.isfinite, velocity)):
-            self._stop("a velocity that is not finite")
-        elif rival := self._commands.rival:
-            self._stop(f"another publisher commands {self._commands.topic}: {rival}")
+            self._commands.resize(self._joints)
+        now = time.monotonic()
+        if now < self._deaf_until:
+            return
+        self._last = now
+        if self._conflict:
+            self._stop(self._conflict)
+        elif not sound or len(velocity) != self._joints:
+            self._stop(f"{velocity} is no command for {self._joints} joints")
         else:
             if self._reason:
                 self.get_logger().info("passing commands on again")
@@ -63,11 +76,35 @@ class CommandWatchdog(StoppableNode):
             self._commands.send(velocity)
 
     def _check(self) -> None:
-        if self._commands is not None and time.monotonic() - self._last > self._config.timeout:
+        self._look()
+        if self._commands.heard and self._source is None:
+            self._source = self.create_subscription(Float64MultiArray, "~/commands", self._relay, qos.COMMAND)
+        elif not self._commands.heard and self._source is not None:
+            self.destroy_subscription(self._source)
+            self._source = None
+        if self._conflict:
+            self._stop(self._conflict)
+        elif time.monotonic() - self._last > self._config.timeout:
             self._stop(f"no command for {self._config.timeout:g} s")
 
+    def _look(self) -> None:
+        now = time.monotonic()
+        if now - self._looked > self._config.timeout:
+            # This process stood still: what has waited for it is old, and its sender may be gone.
+            self._deaf_until = now + self._config.timeout
+        self._looked = now
+        if rival := self._commands.rival:
+            self._conflict = f"another publisher commands {self._commands.topic}: {rival}; until ~/reset"
+
+    def _reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        self._conflict = ""
+        self._look()
+        response.success, response.message = not self._conflict, self._conflict
+        return response
+
     def _stop(self, reason: str) -> None:
-        assert self._commands is not None
+        if not self._joints:
+            return
         if reason != self._reason:
             self.get_logger().error(f"zero velocity: {reason}")
         self._reason = reason
@@ -75,7 +112,7 @@ class CommandWatchdog(StoppableNode):
 
     def finish(self) -> None:
         """See that the last command that the robot got is zero."""
-        if self._commands is not None:
+        if self._joints:
             self._commands.finish()
 
 

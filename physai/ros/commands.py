@@ -27,7 +27,12 @@ class VelocityCommands:
         self._node = node
         self._publisher = node.create_publisher(Float64MultiArray, TOPIC, qos.COMMAND)
         self.topic: str = self._publisher.topic_name
-        self._message = Float64MultiArray(data=array("d", [0.0] * joints))
+        self._message = Float64MultiArray()
+        self.resize(joints)
+
+    def resize(self, joints: int) -> None:
+        """Take another number of velocities in a command."""
+        self._message.data = array("d", [0.0] * joints)
 
     @property
     def rival(self) -> str | None:

@@ -13,7 +13,8 @@ from rich.console import Console
 
 from physai import cli
 from physai.config import Config, Count, PositiveFloat, Seed, compose, validate
-from physai.deploy import Metadata, load_policy, read_metadata
+from physai.deploy import ControllerConfig, Metadata, load_policy, read_metadata
+from physai.deploy.controller import smallest_margin
 from physai.errors import UserError
 
 
@@ -48,6 +49,10 @@ class DemoConfig(Config):
             )
         return found[-1]
 
+    def picture(self) -> Path:
+        """Where the picture goes."""
+        return Path(self.output) if self.output else self.path().with_name("demo.png")
+
 
 def sample_goals(metadata: Metadata, count: int, seed: int) -> np.ndarray:
     """Draw goals [count, 2], m, on the ring that the policy was trained on."""
@@ -62,6 +67,9 @@ def _check(node: DictConfig) -> None:
     metadata = read_metadata(config.path())
     if node.randomization != compose("train", [f"randomization={config.robot}"]).randomization:
         raise UserError("randomization: the virtual robot takes a file of conf/randomization as it is")
+    picture = config.picture()
+    if picture.suffix != ".png" or not os.access(picture.parent, os.W_OK):
+        raise UserError(f"output: cannot write {picture}: a .png in a folder that exists is needed")
     if config.max_velocity > metadata.velocity_limit.min():
         raise UserError(f"max_velocity: the robot's limit is {metadata.velocity_limit.min():g} rad/s")
 
@@ -91,7 +99,12 @@ def _demo(node: DictConfig, _: Path) -> None:
             policy_path=path,
             autostart=True,
             max_velocity=config.max_velocity,
-            limit_margin=max(0.1, round(0.161 * config.max_velocity, 3)),
+            limit_margin=max(
+                ControllerConfig.limit_margin,
+                smallest_margin(
+                    config.max_velocity, ControllerConfig.state_timeout, 1.0 / policy.metadata.control_rate
+                ),
+            ),
         )
         for process in (robot, inference):
             stack.enter_context(process)
@@ -102,7 +115,7 @@ def _demo(node: DictConfig, _: Path) -> None:
         for number, goal in enumerate(goals, 1):
             visit = tourist.visit(goal, config.hold)
             console.print(f"  {number:>3}  {visit.describe()}", highlight=False)
-    output = Path(config.output) if config.output else path.with_name("demo.png")
+    output = config.picture()
     try:
         draw_tour(tourist.tour, policy.metadata, output)
     except (OSError, ValueError) as error:

@@ -107,6 +107,7 @@ class InferenceNode(StoppableNode):
         received = qos.received_at(info)
         self._joint_state = JointState(message.name, message.position, message.velocity, stamp, received)
         if self.config.trigger == "joint_state":
+            self._late = 1.5 / self.config.rate_hz
             self._tick()
 
     def _take_goal(self, message: PointStamped) -> None:
@@ -158,15 +159,17 @@ class InferenceNode(StoppableNode):
     # What goes out
 
     def _on_timer(self) -> None:
-        if self.config.trigger == "timer" or time.monotonic() - self._timing.last > self._late:
-            self._tick()
+        if self.config.trigger == "joint_state" and time.monotonic() - self._timing.last <= self._late:
+            return
+        self._late = 0.0  # until a joint state comes, every period
+        self._tick()
 
     def _tick(self) -> None:
         now = time.monotonic()
         self._timing.tick(now)
+        interlocks = self._interlocks(now)
         joint_state, self._joint_state = self._joint_state, None
         goal, self._goal = self._goal, None
-        interlocks = self._interlocks(now)
         command = self._controller.update(now, joint_state, goal, interlocks)
         self._publish(command)
         before, self._command = self._command, command
@@ -185,8 +188,9 @@ class InferenceNode(StoppableNode):
         rival = self._commands.rival
         if rival is not None:
             found.append(f"another publisher commands {self._commands.topic}: {rival}")
-            if not self._contested and self._publishing:
-                self._controller.forget_goal()  # this node shall not go on by itself when the other one leaves
+            if self._publishing:  # it shall not go on by itself when the other one leaves
+                self._controller.forget_goal()
+                self._goal = None
         self._contested = rival is not None
         if not self._commands.heard:
             found.append(f"no controller listens to {self._commands.topic}")
@@ -198,8 +202,9 @@ class InferenceNode(StoppableNode):
         return found
 
     def _publish(self, command: Command) -> None:
-        # A disabled node does not disturb another one, unless there is an emergency.
-        silent = self._contested and not self._enabled and command.state is not State.ESTOP
+        # A disabled node does not disturb another one, once it stands still, and unless there is an emergency.
+        stands = self._contested and not self._enabled and not any(self._velocity)
+        silent = stands and command.state is not State.ESTOP
         if command.velocity is None or silent or not self._publishing:
             return
         for index, velocity in zip(self._index, command.velocity.tolist(), strict=True):

@@ -13,8 +13,13 @@ COMMAND = QoSProfile(depth=1)
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 """Reliable; who comes later gets the last message."""
 
-EMERGENCY = (SENSOR, COMMAND, LATCHED)
-"""Three subscriptions, so that a message is heard from every kind of publisher, also one that was sent before."""
+EMERGENCY = (
+    QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT),
+    QoSProfile(depth=100),
+    QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL),
+)
+"""Three subscriptions, so that a message is heard from every kind of publisher, also one that was sent before; and
+deep ones, so that a true is not replaced by the false that follows it."""
 
 
 def received_at(info: dict[str, int]) -> float:

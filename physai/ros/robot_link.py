@@ -63,7 +63,7 @@ class RobotLink:
         self._news = threading.Condition()  # also guards what goes out
         self._received, self._stamp, self._refused = -math.inf, -1, ""
         self._state = np.full((2, len(self._joints)), np.nan)
-        self._sent, self._moving, self._used = -math.inf, False, False
+        self._sent, self._moving, self._used, self._closed = -math.inf, False, False, False
         self._commands = VelocityCommands(self._node, len(self._joints))
         self._states = self._node.create_subscription(
             JointState,
@@ -98,7 +98,7 @@ class RobotLink:
 
     def _watch(self) -> None:
         with self._news:
-            if self._moving and time.monotonic() - self._sent > self._silence:
+            if self._moving and not self._closed and time.monotonic() - self._sent > self._silence:
                 self.stop()
 
     def wait_ready(self) -> None:
@@ -135,6 +135,8 @@ class RobotLink:
     def send(self, velocity: Sequence[float]) -> float:
         """Publish velocities [n], rad/s; return the time at which it was done (``time.monotonic``)."""
         with self._news:
+            if self._closed:
+                raise RobotError("the link to the robot is closed")
             self._used, self._moving = True, any(velocity)
             self._sent = time.monotonic()
             self._commands.send(velocity)
@@ -178,8 +180,9 @@ class RobotLink:
         if not self._context.ok():
             return
         try:
-            if self._used:
-                with self._news:
+            with self._news:
+                self._closed = True  # nobody speaks after the last zeros
+                if self._used:
                     self._commands.finish()
         finally:
             self._executor.shutdown(timeout_sec=1.0)

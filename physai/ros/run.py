@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator
 from importlib.resources import files
 
 import rclpy
+from rclpy.exceptions import ParameterException
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
@@ -20,7 +21,15 @@ from physai.deploy.parameters import Parameters
 from physai.errors import UserError
 from physai.ros.parameters import help_text
 
-_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+_SIGNALS = (
+    signal.SIGINT,
+    signal.SIGTERM,
+    signal.SIGHUP,
+    signal.SIGQUIT,
+    signal.SIGUSR1,
+    signal.SIGUSR2,
+    signal.SIGALRM,
+)
 # Jazzy's Fast DDS (2.14) reads the first, later ones the second.
 _PROFILES = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")
 
@@ -80,13 +89,13 @@ def prepare_middleware() -> None:
     """Have Fast DDS find and miss nodes quickly, and use UDP alone (see fastdds.xml); the user's own settings stay."""
     if not any(name in os.environ for name in _PROFILES):
         os.environ.update(dict.fromkeys(_PROFILES, str(files("physai.ros") / "fastdds.xml")))
-    os.environ.setdefault("FASTDDS_BUILTIN_TRANSPORTS", "UDPv4")  # beyond LOCALHOST, where ROS chooses for itself
+        os.environ.setdefault("FASTDDS_BUILTIN_TRANSPORTS", "UDPv4")  # beyond LOCALHOST, where ROS chooses for itself
 
 
 def _run(make_node: Callable[[], StoppableNode], caught: list[int]) -> int:
     try:
         node = make_node()
-    except UserError as error:
+    except (UserError, ParameterException) as error:  # such as a use_sim_time that is no bool
         return _refuse(str(error))
     executor = SingleThreadedExecutor()
     executor.add_node(node)
@@ -103,9 +112,11 @@ def _run(make_node: Callable[[], StoppableNode], caught: list[int]) -> int:
         log.fatal(f"{type(error).__name__} ends this node: {error}\n{traceback.format_exc()}")
         return 1
     finally:
-        executor.shutdown(timeout_sec=1.0)
-        node.finish()
-        node.destroy_node()
+        try:
+            executor.shutdown(timeout_sec=1.0)
+        finally:
+            node.finish()
+            node.destroy_node()
 
 
 @contextlib.contextmanager

@@ -7,8 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
-from physai.config import compose, validate
+from physai.config import compose, conf_dir, nearest, validate
 from physai.envs.simulation import EnvConfig
+from physai.errors import UserError
 from physai.physics import ParameterLayout, RandomizationConfig
 from physai.physics.pybullet import PyBulletPhysics
 from physai.robots import RobotSpec
@@ -65,6 +66,10 @@ class VirtualArm:
     """
 
     def __init__(self, env: str, randomization: str, seed: int, period: float) -> None:
+        for group, name in (("env", env), ("randomization", randomization)):
+            files = [path.stem for path in (conf_dir() / group).glob("*.yaml")]
+            if name not in files:
+                raise UserError(f"{group}: no file '{name}' in conf/{group}{nearest(name, files)}")
         node = compose("train", [f"env={env}", f"randomization={randomization}"])
         config = validate(EnvConfig, node.env)
         draws = validate(RandomizationConfig, node.randomization)

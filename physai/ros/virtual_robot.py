@@ -52,6 +52,8 @@ class VirtualRobot(StoppableNode):
             raise UserError(f"joints: must be {list(known)} in some order, got {list(joints)}")
         self._order = [joints.index(joint) for joint in known]
         self._names = config.state_joints or joints
+        if len(set(self._names)) != len(self._names):
+            raise UserError(f"state_joints: must be distinct, got {list(self._names)}")
         self._shown = [(i, known.index(joint)) for i, joint in enumerate(self._names) if joint in known]
         self._controller = VelocityController(len(joints), config.command_timeout)
         self._faults = Faults(config, config.seed)
@@ -87,10 +89,10 @@ class VirtualRobot(StoppableNode):
         positions, velocities = [0.0] * len(self._names), [0.0] * len(self._names)
         for place, joint in self._shown:
             positions[place], velocities[place] = float(position[joint]), float(velocity[joint])
-        stamp = self.get_clock().now().nanoseconds
+        stamp = self.get_clock().now().nanoseconds * 1e-9
         for state in self._faults.apply(JointState(self._names, positions, velocities, stamp), now):
             message = JointStateMessage(name=state.names, position=state.position, velocity=state.velocity)
-            message.header.stamp = Time(nanoseconds=int(state.stamp)).to_msg()
+            message.header.stamp = Time(nanoseconds=round(state.stamp * 1e9)).to_msg()
             self._states.publish(message)
 
     def finish(self) -> None:

@@ -1,6 +1,7 @@
 """The watchdog between a node and a controller: commands pass, silence and nonsense become zeros."""
 
 import math
+import signal
 import time
 from array import array
 
@@ -68,8 +69,71 @@ def test_another_commander_of_the_controller_stops_the_arm(watchdog):
 
     wait_for(stopped, what="zeros while another one commands")
     watchdog.process.says(f"zero velocity: another publisher commands {TOPIC}: peer")
+    assert not watchdog.call("/command_watchdog/reset").success
     watchdog.node.destroy_publisher(rival)
+    since = time.monotonic()
+    while time.monotonic() < since + 0.5:  # it does not go on by itself
+        send(watchdog, 0.1, 0.2)
+        time.sleep(0.02)
+    watchdog.all_zeros(after=since, commands=20)
+    wait_for(lambda: watchdog.call("/command_watchdog/reset").success, what="a reset after the other one has left")
     passes(watchdog, 0.1, 0.2)
+
+
+def test_what_waited_while_the_watchdog_stood_still_is_not_passed_on(watchdog):
+    for _ in range(3):
+        passes(watchdog, 0.1, 0.2)
+        watchdog.process.signal(signal.SIGSTOP)
+        time.sleep(0.3)
+        for _ in range(5):
+            send(watchdog, 0.1, 0.2)
+        since = time.monotonic()
+        watchdog.process.signal(signal.SIGCONT)
+        watchdog.all_zeros(after=since, commands=10)
+
+
+def test_without_a_controller_it_listens_to_nobody():
+    with free_domain() as domain:
+        peer = Peer(domain, listen_to_commands=False)
+        process = forged("command_watchdog", domain)
+        try:
+            publisher = peer.publisher(Float64MultiArray, "/command_watchdog/commands", 1)
+            wait_for(lambda: "command_watchdog" in peer.node.get_node_names())
+            time.sleep(0.5)
+            assert publisher.get_subscription_count() == 0
+            controller = peer.node.create_subscription(Float64MultiArray, TOPIC, lambda _: None, 1)
+            wait_for(publisher.get_subscription_count, what="a watchdog that listens")
+            peer.node.destroy_subscription(controller)
+            wait_for(lambda: not publisher.get_subscription_count(), what="a watchdog that listens no more")
+        finally:
+            process.end()
+            peer.close()
+
+
+def test_with_a_number_of_joints_zeros_come_from_the_start():
+    with free_domain() as domain:
+        peer = Peer(domain)
+        process = forged("command_watchdog", domain, joints=3)
+        try:
+            wait_for(lambda: len(peer.commands) > 5, what="zeros")
+            assert {tuple(velocity) for _, velocity in peer.commands} == {(0.0, 0.0, 0.0)}
+        finally:
+            process.end()
+            peer.close()
+
+
+@pytest.mark.parametrize("nonsense", [(), (math.nan, 0.1)])
+def test_nonsense_does_not_tell_how_many_joints_there_are(nonsense):
+    with free_domain() as domain:
+        peer = Peer(domain)
+        process = forged("command_watchdog", domain)
+        try:
+            send(peer, *nonsense)
+            passes(peer, 0.1, 0.2)
+            assert {len(velocity) for _, velocity in peer.commands} == {2}
+        finally:
+            process.end()
+            peer.close()
 
 
 def test_the_timeout_can_be_changed(watchdog):

@@ -53,6 +53,20 @@ def test_the_service_stops_the_arm_at_once_and_for_good(loop):
 
 
 @pytest.mark.parametrize("profile", PROFILES.values(), ids=PROFILES)
+def test_a_false_that_follows_at_once_does_not_undo_it(loop, profile):
+    other = loop.peer.publisher(Bool, "/emergency_stop", PROFILES["reliable"])
+    for _ in range(10):
+        loop.start()
+        publisher = loop.peer.publisher(Bool, "/emergency_stop", profile)
+        since = time.monotonic()
+        publisher.publish(Bool(data=True))
+        other.publish(Bool(data=False))
+        publisher.publish(Bool(data=False))
+        assert loop.peer.first_zeros(after=since) < WITHIN
+        loop.peer.wait_state("estop")
+
+
+@pytest.mark.parametrize("profile", PROFILES.values(), ids=PROFILES)
 def test_a_message_of_every_quality_of_service_stops_the_arm_at_once(loop, profile):
     loop.start()
     since = time.monotonic()

@@ -52,6 +52,30 @@ def test_another_commander_that_appears_ends_the_motion_for_good(loop):
     loop.peer.moved(after=since)
 
 
+def test_a_goal_sent_while_another_one_commands_is_not_kept(loop):
+    since = loop.start()
+    rival = loop.peer.node.create_publisher(Float64MultiArray, TOPIC, 1)
+    waits_because_of(loop, f"another publisher commands {TOPIC}: peer")
+    loop.peer.send_goal(*FAR)
+    time.sleep(0.1)
+    since = time.monotonic()
+    loop.peer.node.destroy_publisher(rival)
+    waits_because_of(loop, "no goal yet")
+    loop.peer.all_zeros(after=since, commands=20)
+
+
+def test_to_disable_it_leaves_zeros_also_when_another_one_has_just_come(loop):
+    for wait in (0.0, 0.03, 0.06, 0.09, 0.12):
+        loop.start()
+        rival = loop.peer.node.create_publisher(Float64MultiArray, TOPIC, 1)
+        time.sleep(wait)
+        assert loop.peer.enable(False).success
+        loop.peer.silent()
+        assert loop.peer.commands[-1][1] == [0.0, 0.0]
+        loop.peer.node.destroy_publisher(rival)
+        wait_for(lambda: loop.peer.enable().success, what="permission to move")
+
+
 def test_nothing_moves_without_a_controller_that_listens(policy_path):
     with free_domain() as domain:
         peer = Peer(domain, listen_to_commands=False)

@@ -14,6 +14,8 @@ ENDS = {
     "SIGINT": lambda loop: loop.node.signal(signal.SIGINT),
     "SIGINT, twice": lambda loop: [(loop.node.signal(signal.SIGINT), time.sleep(0.03)) for _ in range(2)],
     "SIGHUP": lambda loop: loop.node.signal(signal.SIGHUP),
+    "SIGQUIT": lambda loop: loop.node.signal(signal.SIGQUIT),
+    "SIGUSR1": lambda loop: loop.node.signal(signal.SIGUSR1),
     "the service": lambda loop: loop.peer.call("/inference_node/shutdown"),
 }
 
