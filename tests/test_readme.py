@@ -8,6 +8,7 @@ import pytest
 
 from physai.ros.command_watchdog import WatchdogConfig
 from physai.ros.inference_node import InferenceConfig
+from physai.ros.record import RecordConfig
 from physai.ros.virtual_robot import VirtualRobotConfig
 
 README = (Path(__file__).parent.parent / "README.md").read_text()
@@ -42,7 +43,12 @@ def parameter_tables() -> dict[str, list[list[str]]]:
 
 @pytest.mark.parametrize(
     ("node", "kind"),
-    [("inference_node", InferenceConfig), ("virtual_robot", VirtualRobotConfig), ("command_watchdog", WatchdogConfig)],
+    [
+        ("record", RecordConfig),
+        ("inference_node", InferenceConfig),
+        ("virtual_robot", VirtualRobotConfig),
+        ("command_watchdog", WatchdogConfig),
+    ],
 )
 def test_the_readme_names_every_parameter_of_a_node_with_its_default_and_unit(node, kind):
     shown = {row[0]: row[1:] for row in parameter_tables()[node]}
@@ -50,6 +56,7 @@ def test_the_readme_names_every_parameter_of_a_node_with_its_default_and_unit(no
     for field in dataclasses.fields(kind):
         default = field.default
         text = f"{default:g}" if isinstance(default, float) else str(default)
+        text = "as above" if field.name == "topics" else text
         text = "" if default in ("", ()) else text.lower() if isinstance(default, bool) else text
         star = " *" if field.metadata["fixed"] else ""
         expected[f"`{field.name}`{star}"] = [text, field.metadata["unit"], field.metadata["description"]]

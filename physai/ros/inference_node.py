@@ -59,6 +59,7 @@ class InferenceNode(StoppableNode):
         self._controller = Controller(policy, config)
         self._goal = _first_goal(config, policy)
         self._joint_state: JointState | None = None
+        self._stamp_age: float | None = None  # s; of use where the robot's clock agrees with ours
         self._command = Command(None, State.WAITING, ())
         self._enabled = config.autostart
         self._publishing = False  # whether this node has a say in what the arm does
@@ -105,6 +106,7 @@ class InferenceNode(StoppableNode):
     def _take_joint_state(self, message: JointStateMessage, info: dict[str, int]) -> None:
         stamp = message.header.stamp.sec + message.header.stamp.nanosec * 1e-9
         received = qos.received_at(info)
+        self._stamp_age = self.get_clock().now().nanoseconds * 1e-9 - stamp
         self._joint_state = JointState(message.name, message.position, message.velocity, stamp, received)
         if self.config.trigger == "joint_state":
             self._late = 1.5 / self.config.rate_hz
@@ -225,7 +227,12 @@ class InferenceNode(StoppableNode):
             self.get_logger().info(text)
 
     def _diagnose(self) -> None:
-        values = {**self._controller.snapshot(), **self._timing.summary(), "enabled": self._enabled}
+        values = {
+            **self._controller.snapshot(),
+            **self._timing.summary(),
+            "enabled": self._enabled,
+            "stamp_age": self._stamp_age,
+        }
         now = self.get_clock().now().to_msg()
         self._diagnostics.publish(diagnose(self.get_name(), now, self._controller.policy, values))
 

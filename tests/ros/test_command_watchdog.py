@@ -46,7 +46,7 @@ def test_silence_becomes_zeros_again_and_again(watchdog):
         passes(watchdog, 0.1, 0.2)
         since = send(watchdog, 0.1, 0.2)
         wait_for(lambda: watchdog.commands[-1][0] > since and any(watchdog.commands[-1][1]))  # noqa: B023
-        assert TIMEOUT - 0.01 < watchdog.first_zeros(after=since) < TIMEOUT + 0.02 + 0.04
+        assert TIMEOUT - 0.01 < watchdog.first_zeros(after=since) < TIMEOUT + 0.02 + 0.1  # a busy machine
         watchdog.all_zeros(after=since + TIMEOUT + 0.06, commands=10)
 
 

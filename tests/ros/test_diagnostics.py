@@ -71,8 +71,8 @@ def test_diagnostics_come_every_second_and_with_every_change(loop, policy_path):
     before = int(values["count: updates"])
     assert before < int(loop.diagnosis()[2]["count: updates"]) < before + 200
     since = loop.arm.pause()
-    loop.peer.wait_state("hold", after=since)
-    level, message, values = loop.diagnosis(after=since)
+    held, _ = loop.peer.wait_state("hold", after=since)
+    level, message, values = loop.diagnosis(after=held - 0.001)
     assert level == 1
     assert message.startswith("hold: the last joint state is 0.1")
     assert int(values["count: holds: state old"]) >= 1
