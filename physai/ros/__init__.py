@@ -4,6 +4,8 @@ They need the ``ros`` extra, or a sourced ROS 2 Jazzy.
 """
 
 import importlib
+import importlib.util
+import sys
 from typing import Any
 
 from physai.errors import UserError
@@ -12,11 +14,18 @@ from physai.errors import UserError
 _HOMES = {"RosPhysics": "physai.ros.physics", "RosReacherEnv": "physai.ros.gym_env"}
 
 
+_WITHOUT_ROS = "rclpy is not installed: pip install 'physai[ros]', or source ROS 2 Jazzy"
+
+if sys.argv[:1] == ["-m"] and importlib.util.find_spec("rclpy") is None:  # python -m physai.ros.<node>
+    print(f"error: {_WITHOUT_ROS}", file=sys.stderr)
+    sys.exit(2)
+
+
 def __getattr__(name: str) -> Any:
     if name not in _HOMES:
         raise AttributeError(f"module '{__name__}' has no attribute '{name}'")
     try:
         import rclpy  # noqa: F401
     except ModuleNotFoundError:
-        raise UserError("rclpy is not installed: pip install 'physai[ros]', or source ROS 2 Jazzy") from None
+        raise UserError(_WITHOUT_ROS) from None
     return getattr(importlib.import_module(_HOMES[name]), name)

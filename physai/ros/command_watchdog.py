@@ -49,6 +49,8 @@ class CommandWatchdog(StoppableNode):
         self._conflict = ""
         self._reason = ""
         self.create_service(Trigger, "~/reset", self._reset)
+        source = self.resolve_topic_name("~/commands")
+        self.get_logger().info(f"passing commands from {source} to {self._commands.topic}")
         self.create_timer(1.0 / config.rate_hz, self._check, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def _configure(self, config: WatchdogConfig) -> None:

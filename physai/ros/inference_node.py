@@ -22,9 +22,9 @@ from physai.ros.diagnostics import Timing, diagnose
 from physai.ros.parameters import declare
 from physai.ros.run import StoppableNode, run
 
-# The slowest of all discoveries that were measured took 0.4 s. It counts from when the controller is found: an
-# emergency stop that was pressed before, or another node that commands, may be found after it.
-_DISCOVERY = 0.5  # s
+# Nodes without our settings of Fast DDS may be found only by its second heartbeat: 2.9 s were measured. And when a
+# controller returns, an emergency stop or another node that commands may be found after it.
+_DISCOVERY, _REDISCOVERY = 3.0, 0.5  # s
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,8 @@ class InferenceNode(StoppableNode):
 
     def __init__(self) -> None:
         super().__init__("inference_node")
-        self._unheard = time.monotonic()  # when no controller listened, for the last time
+        self._started = time.monotonic()
+        self._unheard = self._started  # when no controller listened, for the last time
         self.config = config = declare(self, InferenceConfig, lambda changed: self._controller.configure(changed))
         policy = _load(config)
         self._controller = Controller(policy, config)
@@ -110,6 +111,7 @@ class InferenceNode(StoppableNode):
         self._joint_state = JointState(message.name, message.position, message.velocity, stamp, received)
         if self.config.trigger == "joint_state":
             self._late = 1.5 / self.config.rate_hz
+            self._timing.tick(time.monotonic())
             self._tick()
 
     def _take_goal(self, message: PointStamped) -> None:
@@ -152,8 +154,9 @@ class InferenceNode(StoppableNode):
         return response
 
     def _emergency_stop(self, source: str) -> None:
-        if self._command.state is not State.ESTOP:
-            self.get_logger().error(f"emergency stop by {source}")
+        if self._command.state is State.ESTOP:  # several subscriptions hear the same message
+            return
+        self.get_logger().error(f"emergency stop by {source}")
         self._publishing = True
         self._controller.emergency_stop()
         self._tick()
@@ -164,17 +167,19 @@ class InferenceNode(StoppableNode):
         if self.config.trigger == "joint_state" and time.monotonic() - self._timing.last <= self._late:
             return
         self._late = 0.0  # until a joint state comes, every period
+        self._timing.tick(time.monotonic())
         self._tick()
 
     def _tick(self) -> None:
         now = time.monotonic()
-        self._timing.tick(now)
         interlocks = self._interlocks(now)
         joint_state, self._joint_state = self._joint_state, None
         goal, self._goal = self._goal, None
         command = self._controller.update(now, joint_state, goal, interlocks)
         self._publish(command)
         before, self._command = self._command, command
+        if goal is not None:
+            self.get_logger().info(f"goal ({goal.position[0]:g}, {goal.position[1]:g}) m, in '{goal.frame}'")
         for reason in command.reasons:
             if reason.startswith("goal"):
                 self.get_logger().warning(reason)
@@ -197,7 +202,7 @@ class InferenceNode(StoppableNode):
         if not self._commands.heard:
             found.append(f"no controller listens to {self._commands.topic}")
             self._unheard = now
-        elif now - self._unheard < _DISCOVERY:
+        elif now - self._started < _DISCOVERY or now - self._unheard < _REDISCOVERY:
             found.append("looking for other nodes")
         elif self._enabled and not self._contested:
             self._publishing = True

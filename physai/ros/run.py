@@ -103,7 +103,7 @@ def _run(make_node: Callable[[], StoppableNode], caught: list[int]) -> int:
     try:
         while not node.stopped and not caught:
             executor.spin_once(timeout_sec=0.1)
-        log.info(f"{signal.Signals(caught[0]).name if caught else 'a request'} ends this node")
+        log.info(f"{signal.Signals(caught[0]).name} ends this node" if caught else "this node ends")
         return 0
     except UserError as error:
         log.fatal(str(error))

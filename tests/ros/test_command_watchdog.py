@@ -89,7 +89,11 @@ def test_what_waited_while_the_watchdog_stood_still_is_not_passed_on(watchdog):
             send(watchdog, 0.1, 0.2)
         since = time.monotonic()
         watchdog.process.signal(signal.SIGCONT)
-        watchdog.all_zeros(after=since, commands=10)
+        wait_for(lambda: time.monotonic() > since + 0.3)  # noqa: B023
+        after = [(at, any(velocity)) for at, velocity in watchdog.commands if at > since]
+        moving = [at for at, moves in after if moves]
+        assert len(moving) <= 1  # which it was just sending when it was stopped
+        assert next(at for at, moves in after if not moves) - max([since, *moving]) < 0.05
 
 
 def test_without_a_controller_it_listens_to_nobody():
