@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 import torch
 from filelock import FileLock
+from hypothesis import HealthCheck, settings
 from omegaconf import OmegaConf
 
 from physai.artifact import export_policy
@@ -13,6 +14,11 @@ from physai.config import compose, validate
 from physai.envs.simulation import EnvConfig
 from physai.training.config import TrainConfig
 from physai.training.run import run_training
+
+
+# A busy machine is no fault of a test: how long an example takes says nothing.
+settings.register_profile("physai", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("physai")
 
 
 @pytest.fixture(scope="session", autouse=True)
