@@ -15,7 +15,6 @@ from physai.envs.simulation import EnvConfig
 from physai.training.config import TrainConfig
 from physai.training.run import run_training
 
-
 # A busy machine is no fault of a test: how long an example takes says nothing.
 settings.register_profile("physai", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("physai")
