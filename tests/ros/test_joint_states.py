@@ -69,8 +69,9 @@ def long_ago(message):
 
 GOOD = {
     "reordered, with joints of others": reordered,
-    "every fourth with NaN": sometimes(NAN_POSITION, 4),
-    "every other without a joint": sometimes(spoilt(name=lambda _: ["joint1", "joint3"]), 2),
+    # Rare enough for five good ones in a row, by which a hold ends that a busy machine may have caused.
+    "some with NaN": sometimes(NAN_POSITION, 20),
+    "some without a joint": sometimes(spoilt(name=lambda _: ["joint1", "joint3"]), 20),
     "every third lost": sometimes(lambda message: None, 3),
     "by a clock that is decades behind": long_ago,
 }

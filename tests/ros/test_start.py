@@ -7,6 +7,7 @@ import pytest
 
 from tests.ros.forge import forged
 from tests.ros.loop import closed_loop
+from tests.ros.peer import wait_for
 
 
 @pytest.fixture
@@ -105,5 +106,9 @@ def test_whole_numbers_are_taken_for_floats_and_misspelt_names_warn_with_the_nea
         assert loop.node.says("unknown parameter 'xyz'").endswith("'xyz'")
         loop.node.says("at most 0.1 rad/s")
         loop.peer.moved(commands=100)
-        times = [at for at, _ in loop.peer.commands][-100:]
-        assert 95 < 99 / (times[-1] - times[0]) < 105
+
+        def rate() -> float:
+            times = [at for at, _ in loop.peer.commands][-100:]
+            return 99 / (times[-1] - times[0])
+
+        wait_for(lambda: 95 < rate() < 105, 10.0, "100 commands a second")  # when this process is not busy itself
