@@ -47,7 +47,7 @@ def _play(node: DictConfig, _: Path) -> None:
 
     def show(times: int = 1) -> None:
         for _ in range(times):
-            image = viewer.show(env.simulation.joint_position[0].numpy(), env.simulation.goal[0].numpy())
+            image = viewer.show(env.simulation.joint_position[0], env.simulation.goal[0])
             if image is None:
                 time.sleep(dt)
             else:

@@ -1,6 +1,7 @@
 """``python -m physai.train``: train a policy (see ``--help``)."""
 
 import sys
+from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -10,6 +11,7 @@ from physai import cli
 from physai.errors import UserError
 
 if TYPE_CHECKING:
+    from physai.training.agent import Agent
     from physai.training.config import TrainConfig
 
 
@@ -22,7 +24,8 @@ def main() -> None:
         with cli.guard():
             _resume(Path(resumed[-1].strip("'\"")), others)
     else:
-        cli.main("train", _train, _check)
+        with closing(_Training()) as training:
+            cli.main("train", training.train, training.check)
 
 
 def _config(node: DictConfig) -> "TrainConfig":
@@ -32,21 +35,33 @@ def _config(node: DictConfig) -> "TrainConfig":
     return validate(TrainConfig, node)
 
 
-def _check(node: DictConfig) -> None:
-    """Build every part of a run in small, so that whatever is wrong shows before a run folder exists."""
-    from physai.artifact.module import make_deployable, script
-    from physai.training.agent import Agent
+class _Training:
+    """Builds every part of a run, so that whatever is wrong shows before a run folder exists; then trains with them."""
 
-    config = _config(node)
-    agent = Agent.build(config)
-    try:
-        script(make_deployable(agent.actor, agent.env))  # what is no TorchScript could not be exported at the end
-    finally:
-        agent.close()
+    def __init__(self) -> None:
+        self._config: TrainConfig | None = None
+        self._agent: Agent | None = None
 
+    def check(self, node: DictConfig) -> None:
+        from physai.artifact.module import make_deployable, script
+        from physai.training.agent import Agent
 
-def _train(node: DictConfig, run_dir: Path) -> None:
-    _run(_config(node), run_dir, resume=False)
+        self.close()
+        self._config = _config(node)
+        self._agent = Agent.build(self._config)
+        script(make_deployable(self._agent.actor, self._agent.env))  # what does not script could not be exported
+
+    def train(self, node: DictConfig, run_dir: Path) -> None:
+        config = _config(node)
+        if config != self._config:  # the last to be checked is not the first of a sweep
+            self.close()
+        agent, self._agent = self._agent, None
+        _run(config, run_dir, resume=False, agent=agent)
+
+    def close(self) -> None:
+        if self._agent is not None:
+            self._agent.close()
+            self._agent = None
 
 
 def _resume(run_dir: Path, given: list[str]) -> None:
@@ -75,13 +90,13 @@ def _first_difference(run: Any, wanted: Any, key: str = "") -> str | None:
     return None if run == wanted else f"{key}={run}, not {wanted}"
 
 
-def _run(config: "TrainConfig", run_dir: Path, resume: bool) -> None:
+def _run(config: "TrainConfig", run_dir: Path, resume: bool, agent: "Agent | None" = None) -> None:
     from physai.training.loop import Interrupted
     from physai.training.run import run_training
 
     complete = (run_dir / "summary.json").is_file()
     try:
-        run_training(config, run_dir, resume)
+        run_training(config, run_dir, resume, agent)
         _export(run_dir, complete)
     except Interrupted as stopped:
         print(f"\nStopped by {stopped}; everything is saved. Go on with:\n  python -m physai.train resume={run_dir}")

@@ -9,7 +9,7 @@ from physai.errors import UserError
 from physai.training.agent import Agent
 from physai.training.config import TrainConfig
 
-SMALL = ("collector.num_envs=4", "collector.frames_per_batch=64", "algo.buffer.batch_size=32")
+SMALL = ("collector.num_envs=4", "collector.frames_per_batch=64", "algo.minibatch_size=32")
 
 
 def choices(group: str) -> list[str]:
@@ -45,7 +45,7 @@ def test_sb3_defaults_are_the_well_known_numbers():
         0.5,
     )
     assert (config.collector.num_envs, config.collector.frames_per_batch) == (4, 4 * 2048)
-    assert algo["buffer"]["batch_size"] == 64
+    assert algo["minibatch_size"] == 64
     assert algo["scheduler"] is None
     assert (config.total_frames, config.evaluation.every_frames, config.checkpoint.every_frames) == (
         500_000,
@@ -69,7 +69,7 @@ def test_the_package_carries_no_second_copy_of_the_configs():
 
 def test_counts_may_be_written_as_people_write_them():
     config = validate(
-        TrainConfig, compose("train", ["total_frames=1e6", "algo.epochs=1e1", "algo.buffer.batch_size=1_024"])
+        TrainConfig, compose("train", ["total_frames=1e6", "algo.epochs=1e1", "algo.minibatch_size=1_024"])
     )
-    assert (config.total_frames, config.algo["epochs"], config.algo["buffer"]["batch_size"]) == (1_000_000, 10, 1024)
+    assert (config.total_frames, config.algo["epochs"], config.algo["minibatch_size"]) == (1_000_000, 10, 1024)
     assert isinstance(config.algo["epochs"], int)

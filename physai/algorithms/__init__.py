@@ -1,5 +1,6 @@
 """Learning from collected frames."""
 
 from physai.algorithms.on_policy import NonFiniteError, OnPolicy
+from physai.algorithms.ppo_loss import FusedClipPPOLoss
 
-__all__ = ["NonFiniteError", "OnPolicy"]
+__all__ = ["FusedClipPPOLoss", "NonFiniteError", "OnPolicy"]

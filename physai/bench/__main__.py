@@ -1,63 +1,68 @@
 """``python -m physai.bench``: physai against what it stands on, and Stable-Baselines3 (see ``--help``)."""
 
 import argparse
+from importlib import import_module
 from importlib.util import find_spec
+from pathlib import Path
 
 from rich.console import Console
 
 from physai import cli
-from physai.artifact import onnx
-from physai.bench.collection import collection_table, measure_collection
-from physai.bench.policy import measure_policy, policy_table
 from physai.bench.timing import machine
-from physai.bench.training import measure_training, training_table
 from physai.errors import UserError
+
+# Each is a module here, with a function ``run``.
+PARTS = {
+    "policy": "one command of an exported policy, in every form that it has",
+    "ros": "period and answers of the ROS 2 node, beside a bare one's",
+    "gym": "the Gymnasium envs, against one written by hand and Stable-Baselines3's vector env",
+    "startup": "how soon commands answer, how soon the first frame is there, and how long a thousand episodes take",
+    "collection": "collection by one process and by two, against a bare PyBullet loop",
+    "update": "learning from a batch, against PPO written by hand",
+    "training": "time to 99 percent of unseen goals, against Stable-Baselines3 PPO",
+    "growth": "time and memory of training against frames and robots",
+}
+NEEDS = {  # the extra that a part needs, and a module of it
+    "policy": ("onnx", "onnxruntime"),
+    "ros": ("ros", "rclpy"),
+    "gym": ("bench", "stable_baselines3"),
+    "training": ("bench", "stable_baselines3"),
+}
 
 
 def main() -> None:
     """Measure, then show the figures as tables."""
     options = _options()
-    everything = not (options.collect or options.train or options.policy or options.ros)
     with cli.guard():
-        if (everything or options.train) and find_spec("stable_baselines3") is None:
-            raise UserError("no stable_baselines3 here: pip install 'physai[bench]', or use --collect or --policy")
-        if (everything or options.policy) and onnx.missing():
-            raise UserError(f"no {onnx.missing()[0]} here: pip install 'physai[onnx]', or use --collect or --train")
-        if (everything or options.ros) and find_spec("rclpy") is None:
-            raise UserError("no rclpy here: pip install 'physai[ros]', or use --policy, --collect or --train")
+        for part in options.parts:
+            extra, module = NEEDS.get(part, ("", "physai"))
+            if find_spec(module) is None:
+                raise UserError(f"--{part}: no {module} here (pip install 'physai[{extra}]')")
         print(machine(), flush=True)
         tables = []
-        if everything or options.policy:
-            tables.append(policy_table(*measure_policy(options.seed)))
-        if everything or options.ros:
-            from physai.bench.ros import measure_ros, ros_table  # ROS reads its environment when it is imported
-
-            tables.append(ros_table(measure_ros(options.seed)))
-        if everything or options.collect:
-            tables.append(collection_table(*measure_collection(options.seed)))
-        if everything or options.train:
-            tables.append(training_table(*measure_training(options.seed, options.seeds, options.sb3_frames)))
+        for part in options.parts:
+            print(f"\n--{part}: {PARTS[part]}", flush=True)
+            # Only what is measured is imported: ROS, for one, reads its environment then.
+            tables.append(import_module(f"physai.bench.{part}").run(options))
         Console().print(*tables)
 
 
 def _options() -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         prog="python -m physai.bench",
-        description="Measure physai on the two-link arm: how long an exported policy takes for a command, against "
-        "TorchRL's actor; how well the ROS 2 node keeps its 50 Hz, beside a bare one; how fast it collects, against a "
-        "bare PyBullet loop; and how soon its policy reaches 99 % of unseen goals, against Stable-Baselines3 PPO.",
-        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+        description="Measure physai on the two-link arm, side by side with what it is compared to: the parts that are "
+        "named, or all of them, which takes an hour.",
     )
-    part = parser.add_mutually_exclusive_group()
-    part.add_argument("--policy", action="store_true", help="measure the exported policy only")
-    part.add_argument("--ros", action="store_true", help="measure the ROS 2 node only")
-    part.add_argument("--collect", action="store_true", help="measure collection only")
-    part.add_argument("--train", action="store_true", help="measure training only")
-    parser.add_argument("--seed", type=int, default=0, help="seed of all sides")
-    parser.add_argument("--seeds", type=int, default=1, help="train physai so often, with seeds counting up")
-    sb3_frames = "where Stable-Baselines3 gives up; what physai is ahead by is then a lower bound"
-    parser.add_argument("--sb3-frames", type=int, default=2_000_000, help=sb3_frames)
+    for part, meaning in PARTS.items():
+        parser.add_argument(f"--{part}", dest="parts", action="append_const", const=part, help=meaning)
+    parser.add_argument("--seed", type=int, default=0, help="seed of all sides (0)")
+    parser.add_argument("--seeds", type=int, default=5, help="train so often, with seeds counting up (5)")
+    sb3_frames = "where Stable-Baselines3 gives up; what physai is ahead by is then a lower bound (1,000,000)"
+    parser.add_argument("--sb3-frames", type=int, default=1_000_000, help=sb3_frames)
+    figure = Path("outputs/growth.png")
+    parser.add_argument("--figure", type=Path, default=figure, help=f"where --growth draws ({figure})")
     options = parser.parse_args()
+    options.parts = options.parts or list(PARTS)
     if options.seed < 0 or options.seeds < 1 or options.sb3_frames < 1:
         parser.error("--seed must not be negative, --seeds and --sb3-frames must be positive")
     return options

@@ -1,7 +1,9 @@
 """How fast robots are collected from, against a bare PyBullet loop."""
 
+from argparse import Namespace
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 
 import numpy as np
 import pybullet as bullet
@@ -18,53 +20,71 @@ from physai.training.config import TrainConfig
 
 ROBOTS = (1, 16, 64, 128, 256, 512, 1024)
 ROUNDS = 7
-BATCHES_PER_ROUND = 7  # longer than an episode, so that every round pays for its resets
+STEPS_PER_ROUND = 112  # longer than most episodes, so that every round pays for its resets
+SMALL = 32  # fewer robots hand over one batch a round: nobody would collect batches of a few frames
+
+
+def run(options: Namespace) -> Table:
+    """Measure, and show it."""
+    return collection_table(*measure_collection(options.seed))
 
 
 def measure_collection(seed: int) -> tuple[int, dict[int, list[float]]]:
-    """Return the default number of robots; and by their number, robot-steps/s bare and of the collector."""
+    """Return the default number of robots; and by their number, robot-steps/s bare, of one process and of two."""
     config = reacher(seed)
     torch.set_num_threads(config.threads)
     speeds = {}
     for robots in sorted({*ROBOTS, config.collector.num_envs}):
-        bare, collector = speeds[robots] = _collection_speeds(config, robots)
-        print(f"{robots:>5,} robots: collector {collector:>8,.0f}/s, bare {bare:>8,.0f}/s", flush=True)
+        speeds[robots] = _collection_speeds(config, robots)
+        figures = zip(("bare", "one process", "two"), speeds[robots], strict=True)
+        print(f"{robots:>5,} robots: {', '.join(f'{name} {speed:,.0f}/s' for name, speed in figures)}", flush=True)
     return config.collector.num_envs, speeds
 
 
 def _collection_speeds(config: TrainConfig, robots: int) -> list[float]:
-    steps = config.collector.frames_per_batch // config.collector.num_envs
-    size = CollectorConfig(num_envs=robots, frames_per_batch=steps * robots)
-    total_frames = (1 + ROUNDS) * BATCHES_PER_ROUND * size.frames_per_batch
-    env = make_env(config.env, config.randomization, config.normalization, robots, config.seed)
-    collector = make_collector(size, env, make_actor(config, env), total_frames)
-    batches = iter(collector)
+    spec = RobotSpec.from_config(config.env.robot)
+    # Like an untrained policy's, the commands change all the time: a settled motor is cheaper to solve.
+    shape = (STEPS_PER_ROUND, robots, len(spec.joints))
+    commands = config.env.max_velocity * np.random.default_rng(config.seed).uniform(-1, 1, shape)
+    with (
+        bare_loop(spec, config.env.control_dt, commands) as bare,
+        _collection(config, robots, processes=1) as one,
+        _collection(config, robots, processes=2) as two,
+    ):
+        return median_speeds(bare, one, two, rounds=ROUNDS)
+
+
+@contextmanager
+def _collection(config: TrainConfig, robots: int, processes: int) -> Iterator[Callable[[], int]]:
+    """Make what a learner waits for: batches from so many robots in each process."""
+    batches = 1 if robots < SMALL else STEPS_PER_ROUND * config.collector.num_envs // config.collector.frames_per_batch
+    frames = STEPS_PER_ROUND // batches * robots * processes
+    size = CollectorConfig(num_envs=robots * processes, frames_per_batch=frames, processes=processes)
+    make_robots = partial(make_env, config.env, config.randomization, config.normalization)
+    env = make_robots(size.robots_here, config.seed)
+    total_frames = (1 + ROUNDS) * batches * frames
+    collector = make_collector(size, env, make_robots, make_actor(config, env), total_frames, config.seed)
+    source = iter(collector)
 
     def collect() -> int:
-        frames = 0
-        for _ in range(BATCHES_PER_ROUND):
-            batch = next(batches)
-            env.normalization.update(batch.get("observation"))
-            frames += batch.numel()
-        return frames
+        for _ in range(batches):
+            env.normalization.update(next(source).get("observation"))
+        return batches * frames
 
-    # Like an untrained policy's, the commands change all the time: a settled motor is cheaper to solve.
-    shape = (BATCHES_PER_ROUND * steps, robots, len(env.simulation.spec.joints))
-    commands = config.env.max_velocity * np.random.default_rng(config.seed).uniform(-1, 1, shape)
-    with bare_loop(env.simulation.spec, config.env.control_dt, commands) as bare:
-        try:
-            return median_speeds(bare, collect, rounds=ROUNDS)
-        finally:
-            collector.shutdown()
+    try:
+        yield collect
+    finally:
+        collector.shutdown()
 
 
 def collection_table(default: int, speeds: dict[int, list[float]]) -> Table:
     """Show robot-steps per second; the default number of robots stands out."""
-    title = "Collection, robot-steps/s: one process, one thread, randomization=default"
-    shown = table(title, "robots", "bare PyBullet", "TorchRL collector", "ratio")
-    for robots, (bare, collector) in speeds.items():
+    title = "Collection, robot-steps/s: one thread a process, randomization=default"
+    columns = "robots a process", "bare PyBullet", "one process", "of bare", "two processes", "of one"
+    shown = table(title, *columns)
+    for robots, (bare, one, two) in speeds.items():
         style, mark = ("bold", " (default)") if robots == default else (None, "")
-        figures = f"{bare:,.0f}", f"{collector:,.0f}", f"{collector / bare:.2f}"
+        figures = f"{bare:,.0f}", f"{one:,.0f}", f"{one / bare:.2f}", f"{two:,.0f}", f"{two / one:.2f}"
         shown.add_row(f"{robots:,}{mark}", *figures, style=style)
     return shown
 

@@ -5,6 +5,7 @@ import io
 import statistics
 import tempfile
 import time
+from argparse import Namespace
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -34,6 +35,11 @@ LOADS = 20
 Call = Callable[[], Any]
 
 
+def run(options: Namespace) -> Table:
+    """Measure, and show it."""
+    return policy_table(*measure_policy(options.seed))
+
+
 def measure_policy(seed: int) -> tuple[dict[str, np.ndarray], float]:
     """Return the times of single calls by form, s, and the median time to load a policy file, s."""
     with tempfile.TemporaryDirectory() as folder:
@@ -51,14 +57,19 @@ def measure_policy(seed: int) -> tuple[dict[str, np.ndarray], float]:
 
 def make_run(run: Path, seed: int, formats: list[str]) -> None:
     """Train a little, and export the policy in these formats; how good it is does not matter here."""
-    config = reacher(seed, f"total_frames={FRAMES}", "evaluation.episodes=100")
+    print(f"Exporting a policy that has seen {FRAMES:,} frames; how good it is does not matter ...", flush=True)
+    train_run(run, seed, f"total_frames={FRAMES}", "evaluation.episodes=100")
+    export_policy(run, "best", formats, episodes=10)
+
+
+def train_run(run: Path, seed: int, *overrides: str) -> None:
+    """Train in an empty folder, without a word."""
+    config = reacher(seed, *overrides)
     torch.set_num_threads(config.threads)
     (run / ".hydra").mkdir()
     (run / ".hydra" / "config.yaml").write_text(OmegaConf.to_yaml(config.model_dump(mode="json")))
-    print(f"Exporting a policy that has seen {FRAMES:,} frames; how good it is does not matter ...", flush=True)
     with contextlib.redirect_stdout(io.StringIO()):
         run_training(config, run)
-    export_policy(run, "best", formats, episodes=10)
 
 
 def _forms(run: Path) -> dict[str, Call]:

@@ -3,6 +3,7 @@
 import os
 import tempfile
 import time
+from argparse import Namespace
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -86,6 +87,11 @@ class _Listener:
         self._executor.shutdown()
         self.node.destroy_node()
         self._context.try_shutdown()
+
+
+def run(options: Namespace) -> Table:
+    """Measure, and show it."""
+    return ros_table(measure_ros(options.seed))
 
 
 def measure_ros(seed: int) -> dict[str, RosFigures]:

@@ -3,19 +3,7 @@
 from typing import Any
 
 from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import TensorDictModuleBase
 from torchrl.collectors import Collector
-
-from physai.config import Config, Count
-from physai.envs.make import TransformedRobotEnv
-from physai.errors import UserError
-
-
-class CollectorConfig(Config):
-    """One file of ``conf/collector``."""
-
-    num_envs: Count
-    frames_per_batch: Count
 
 
 class RobotCollector(Collector):
@@ -43,27 +31,4 @@ class RobotCollector(Collector):
         """Restore what ``state`` returned, in a collector made from the same config."""
         self.env.set_state(state["env"])
         self._carrier = TensorDict(state["carrier"], batch_size=self.env.batch_size)
-        self._frames, self._iter = state["frames"], state["iterations"]
-
-
-def make_collector(
-    config: CollectorConfig, env: TransformedRobotEnv, policy: TensorDictModuleBase, total_frames: int
-) -> RobotCollector:
-    """Build the collector that a config describes.
-
-    Raises:
-        UserError: If a batch is not a whole number of steps of all robots.
-    """
-    if config.frames_per_batch % config.num_envs:
-        raise UserError(
-            f"collector.frames_per_batch ({config.frames_per_batch}) must be a multiple of "
-            f"collector.num_envs ({config.num_envs})"
-        )
-    return RobotCollector(
-        env,
-        policy,
-        frames_per_batch=config.frames_per_batch,
-        total_frames=-(-total_frames // config.frames_per_batch) * config.frames_per_batch,
-        track_traj_ids=False,
-        auto_register_policy_transforms=False,
-    )
+        self._frames, self._iter = int(state["frames"]), int(state["iterations"])

@@ -6,7 +6,6 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-import torch
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
@@ -28,13 +27,6 @@ def _spaces(simulation: Simulation) -> tuple[spaces.Box, spaces.Box]:
     low, high = simulation.task.observation_bounds(simulation.spec, simulation.kinematics)
     observation = spaces.Box(low.numpy(), high.numpy(), dtype=np.float32)
     return observation, spaces.Box(-1.0, 1.0, (len(simulation.spec.joints),), np.float32)
-
-
-def _observe(simulation: Simulation) -> Array:
-    module = simulation.observation
-    with torch.no_grad():
-        observation, _ = module(simulation.joint_position, simulation.joint_velocity, simulation.goal)
-    return observation.numpy()
 
 
 class RobotGymEnv(gymnasium.Env[Array, Array]):
@@ -68,17 +60,13 @@ class RobotGymEnv(gymnasium.Env[Array, Array]):
             self._seeded = True
         self.simulation.reset()
         self._show()
-        return _observe(self.simulation)[0], self._info(False)
+        return self.simulation.observe()[0], {"is_success": False, "distance": self.simulation.distance.item()}
 
     def step(self, action: Array) -> tuple[Array, float, bool, bool, dict[str, Any]]:
         """Apply an action [n] in [-1, 1] for one control period."""
-        reward, terminated, truncated = self.simulation.step(torch.as_tensor(action, dtype=torch.float32)[None])
+        moment = self.simulation.step_one(np.asarray(action, np.float32))
         self._show()
-        success = bool(terminated)
-        return _observe(self.simulation)[0], float(reward), success, bool(truncated), self._info(success)
-
-    def _info(self, success: bool) -> dict[str, Any]:
-        return {"is_success": success, "distance": float(self.simulation.distance)}
+        return moment
 
     def _show(self) -> None:
         if self.render_mode == "human":
@@ -89,7 +77,7 @@ class RobotGymEnv(gymnasium.Env[Array, Array]):
     def _picture(self) -> Array | None:
         if self._viewer is None:
             self._viewer = self.simulation.viewer(window=self.render_mode == "human")
-        return self._viewer.show(self.simulation.joint_position[0].numpy(), self.simulation.goal[0].numpy())
+        return self._viewer.show(self.simulation.joint_position[0], self.simulation.goal[0])
 
     def render(self) -> Array | None:
         """Return an image [height, width, 3] uint8 in the mode ``rgb_array``."""
@@ -129,7 +117,7 @@ class RobotVectorEnv(VectorEnv[Array, Array, Array]):
         self.single_observation_space, self.single_action_space = _spaces(self.simulation)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
-        self._over = torch.zeros(num_envs, dtype=torch.bool)
+        self._over = np.zeros(num_envs, bool)
         self._viewer: Viewer | None = None
         self._seeded = False
 
@@ -140,22 +128,22 @@ class RobotVectorEnv(VectorEnv[Array, Array, Array]):
             self.simulation.seed(int(self.np_random.integers(2**63 - 1)))
             self._seeded = True
         self.simulation.reset()
-        self._over = torch.zeros(self.num_envs, dtype=torch.bool)
-        return _observe(self.simulation), {}
+        self._over = np.zeros(self.num_envs, bool)
+        return self.simulation.observe(), {}
 
     def step(self, actions: Array) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
         """Apply actions [N, n]; rows whose episode is over start a new one instead."""
         fresh = self._over
-        reward, terminated, truncated = self.simulation.step(torch.as_tensor(actions, dtype=torch.float32))
+        reward, terminated, truncated = self.simulation.step(np.asarray(actions, np.float32))
         if fresh.any():
             self.simulation.reset(fresh)
             reward, terminated, truncated = (
-                value.masked_fill(fresh[:, None], 0) for value in (reward, terminated, truncated)
+                np.where(fresh[:, None], np.zeros_like(value), value) for value in (reward, terminated, truncated)
             )
         self._over = (terminated | truncated)[:, 0]
-        info = {"is_success": terminated[:, 0].numpy(), "distance": self.simulation.distance[:, 0].numpy()}
+        info = {"is_success": terminated[:, 0], "distance": self.simulation.distance[:, 0]}
         reward, terminated, truncated = reward[:, 0], terminated[:, 0], truncated[:, 0]
-        return _observe(self.simulation), reward.numpy(), terminated.numpy(), truncated.numpy(), info
+        return self.simulation.observe(), reward, terminated, truncated, info
 
     def render(self) -> tuple[Array, ...] | None:
         """Return an image of the first robot."""
@@ -163,7 +151,7 @@ class RobotVectorEnv(VectorEnv[Array, Array, Array]):
             return None
         if self._viewer is None:
             self._viewer = self.simulation.viewer()
-        image = self._viewer.show(self.simulation.joint_position[0].numpy(), self.simulation.goal[0].numpy())
+        image = self._viewer.show(self.simulation.joint_position[0], self.simulation.goal[0])
         return None if image is None else (image,)
 
     def close_extras(self, **kwargs: Any) -> None:

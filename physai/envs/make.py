@@ -61,13 +61,15 @@ class TransformedRobotEnv(TransformedEnv):
         """
         after = self._step(tensordict)
         tensordict.set("next", after)
-        carried = after.exclude("reward")
         done = after.get("done")
-        if done.any():
-            fresh = self._reset(TensorDict({"_reset": done}, self.batch_size))
-            # Sensors answer anew in every row; those that go on keep what they have seen.
-            carried.update({key: torch.where(done, value, carried.get(key)) for key, value in fresh.items()})
-        return tensordict, carried
+        if not done.any():
+            return tensordict, after.exclude("reward")
+        fresh = self._reset(TensorDict({"_reset": done}, self.batch_size))
+        # Sensors answer anew in every row; those that go on keep what they have seen.
+        for transform in self.transform:
+            for key in transform.out_keys:
+                fresh.set(key, torch.where(done, fresh.get(key), after.get(key)))
+        return tensordict, fresh
 
     def set_seed(self, seed: int | None = None, static_seed: bool = False) -> int | None:
         """Seed goals and starts, and each transform with a seed of its own."""

@@ -7,6 +7,8 @@ from torchrl.envs import EnvBase
 
 from physai.envs.simulation import EnvConfig, Simulation
 
+_OBSERVED = ("joint_position", "joint_velocity", "goal", "physics_parameters", "episode_length", "episode_return")
+
 
 class RobotEnv(EnvBase):
     """N robots at a task, ``batch_size=[N]``.
@@ -47,31 +49,23 @@ class RobotEnv(EnvBase):
         )
 
     def _observe(self) -> dict[str, torch.Tensor]:
-        simulation = self.simulation
-        return {
-            "joint_position": simulation.joint_position,
-            "joint_velocity": simulation.joint_velocity,
-            "goal": simulation.goal,
-            "physics_parameters": simulation.parameters,
-            "episode_length": simulation.episode_length,
-            "episode_return": simulation.episode_return,
-        }
+        return {key: torch.from_numpy(getattr(self.simulation, key)) for key in _OBSERVED}
 
     def _reset(self, tensordict: TensorDictBase | None = None, **_: object) -> TensorDict:
         rows = parameters = None
         if tensordict is not None:
-            mask = tensordict.get("_reset", None)
-            rows = None if mask is None else mask[:, 0]
-            parameters = tensordict.get("physics_parameters", None)
+            mask, given = tensordict.get("_reset", None), tensordict.get("physics_parameters", None)
+            rows = None if mask is None else mask[:, 0].numpy()
+            parameters = None if given is None else given.numpy()
         self.simulation.reset(rows, parameters)
-        false = torch.zeros(self.num_robots, 1, dtype=torch.bool)
-        done = {"done": false, "terminated": false.clone(), "truncated": false.clone()}
+        done = {key: torch.zeros(self.num_robots, 1, dtype=torch.bool) for key in ("done", "terminated", "truncated")}
         return TensorDict({**self._observe(), **done}, batch_size=self.batch_size)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
-        reward, terminated, truncated = self.simulation.step(tensordict.get("action"))
-        done = {"done": terminated | truncated, "terminated": terminated, "truncated": truncated}
-        return TensorDict({**self._observe(), "reward": reward, **done}, batch_size=self.batch_size)
+        reward, terminated, truncated = self.simulation.step(tensordict.get("action").numpy())
+        results = {"reward": reward, "done": terminated | truncated, "terminated": terminated, "truncated": truncated}
+        after = {key: torch.from_numpy(value) for key, value in results.items()}
+        return TensorDict({**self._observe(), **after}, batch_size=self.batch_size)
 
     @property
     def num_robots(self) -> int:

@@ -1,7 +1,9 @@
 """N robots at a task: the core that the TorchRL and the Gymnasium shells share."""
 
+import math
 from typing import Any
 
+import numpy as np
 import torch
 from hydra.utils import get_object, instantiate
 from torch import Tensor
@@ -10,7 +12,9 @@ from physai.config import Config, Count, PositiveFloat, Target
 from physai.errors import UserError
 from physai.physics import ParameterLayout, Physics
 from physai.physics.viewer import Viewer
-from physai.robots import ForwardKinematics, RobotConfig, RobotSpec
+from physai.robots import ForwardKinematics, RobotConfig, RobotSpec, TipPosition
+
+_STATE = ("goal", "episode_length", "episode_return", "physics_parameters")  # beside what the physics holds
 
 
 class EnvConfig(Config):
@@ -34,8 +38,30 @@ class EnvConfig(Config):
         return bool(get_object(self.physics["_target_"]).simulated)
 
 
+class _Rows:
+    """An array of one row a robot, which is made when it is asked for if it was given as lists.
+
+    Lists come from ``step_one``, which has no time for six small arrays that nobody may look at.
+    """
+
+    def __init__(self, dtype: type) -> None:
+        self._dtype = dtype
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self._name = f"_{name}"
+
+    def __get__(self, simulation: "Simulation", owner: type) -> np.ndarray:
+        return np.asarray(getattr(simulation, self._name), self._dtype)
+
+    def __set__(self, simulation: "Simulation", value: Any) -> None:
+        setattr(simulation, self._name, value)
+
+
 class Simulation:
     """Robots, physics and task, batched; rows are robots and episodes run independently in each.
+
+    Arrays are NumPy's, for these are small: a call of torch costs more than what it computes. An array is never written
+    to again once it has been handed out: it may live on in a collected batch.
 
     Args:
         config: The environment.
@@ -45,18 +71,24 @@ class Simulation:
     Attributes:
         observation: The task's module that makes what a policy sees, and knows the distance to the goal.
         joint_position, joint_velocity: True joint state, rad and rad/s, [N, n].
+        end_effector: True position of the end effector in the plane, m, [N, 2].
         goal: [N, 2], m.
         distance: To the goal, m, [N, 1].
         episode_length: Control steps since the last reset, [N, 1].
         episode_return: Sum of rewards since the last reset, [N, 1].
-        parameters: ``physics_parameters`` in force, [N, P] (see :class:`physai.physics.ParameterLayout`).
+        physics_parameters: Those in force, [N, P] (see :class:`physai.physics.ParameterLayout`).
     """
+
+    joint_position, joint_velocity, end_effector, distance, episode_return = (_Rows(np.float32) for _ in range(5))
+    episode_length = _Rows(np.int64)
 
     def __init__(self, config: EnvConfig, num_envs: int, seed: int) -> None:
         self.config = config
         self.num_envs = num_envs
         self.spec = RobotSpec.from_config(config.robot)
         self.kinematics = ForwardKinematics(self.spec)
+        self._tip = TipPosition(self.kinematics)
+        self._continuous = self.spec.continuous.nonzero()[0].tolist()
         self.layout = ParameterLayout(self.spec)
         self.task = instantiate(config.task, _convert_="all")
         self.task.check(self.spec, self.kinematics)
@@ -74,66 +106,93 @@ class Simulation:
         self.generator = torch.Generator()
         self.seed(seed)
         joints = len(self.spec.joints)
-        self.joint_position = torch.zeros(num_envs, joints)
-        self.joint_velocity = torch.zeros(num_envs, joints)
-        self.goal = torch.zeros(num_envs, self.task.goal_size)
-        self.distance = torch.zeros(num_envs, 1)
-        self.episode_length = torch.zeros(num_envs, 1, dtype=torch.int64)
-        self.episode_return = torch.zeros(num_envs, 1)
-        self.parameters = self.layout.nominal.repeat(num_envs, 1)
+        self.joint_position, self.joint_velocity, self.goal, self.end_effector, self.distance = (
+            np.zeros((num_envs, size), np.float32) for size in (joints, joints, self.task.goal_size, 2, 1)
+        )
+        self._episode_length: Any = np.zeros((num_envs, 1), np.int64)
+        self._episode_return: Any = np.zeros((num_envs, 1), np.float32)
+        self.physics_parameters = self.layout.nominal.repeat(num_envs, 1).numpy()
 
     def seed(self, seed: int) -> None:
         """Restart the random numbers of goals and start poses."""
         self.generator.manual_seed(seed)
 
-    @torch.no_grad()
-    def reset(self, rows: Tensor | None = None, parameters: Tensor | None = None) -> None:
+    def reset(self, rows: np.ndarray | None = None, parameters: np.ndarray | None = None) -> None:
         """Start new episodes in the rows of a mask [N] (all by default), with new parameters [N, P] if given."""
-        index = torch.arange(self.num_envs) if rows is None else rows.nonzero()[:, 0]
+        index = np.arange(self.num_envs) if rows is None else rows.nonzero()[0]
         start = self.task.sample_start(len(index), self.spec, self.generator)
+        self.goal = _replaced(self.goal, index, self.task.sample_goal(len(index), self.generator))
+        self.episode_length = _replaced(self.episode_length, index, 0)
+        self.episode_return = _replaced(self.episode_return, index, 0.0)
         dynamics = None
-        # New tensors, not writes in place: the old ones may live on in a collected batch.
-        self.goal = self.goal.index_put((index,), self.task.sample_goal(len(index), self.generator))
-        self.episode_length = self.episode_length.index_fill(0, index, 0)
-        self.episode_return = self.episode_return.index_fill(0, index, 0.0)
         if parameters is not None:
             new = parameters[index]
-            self.parameters = self.parameters.index_put((index,), new)
+            self.physics_parameters = _replaced(self.physics_parameters, index, new)
             dynamics = self.layout.dynamics(new)
-        self.physics.reset(index.numpy(), start.numpy(), torch.zeros_like(start).numpy(), dynamics)
+        self.physics.reset(index, start, np.zeros_like(start), dynamics)
         self._read(*self.physics.joint_state())
 
-    @torch.no_grad()
-    def step(self, action: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Apply actions [N, n] in [-1, 1] for one control period.
 
         Returns:
             reward, terminated, truncated, each [N, 1]. Reaching the goal terminates; running out of time truncates,
             and a step that does both only terminates.
         """
-        command = action.double().clamp(-1.0, 1.0) * self.config.max_velocity
-        self._read(*self.physics.step(command.numpy()))
+        command = np.maximum(np.minimum(action, 1.0), -1.0) * np.float64(self.config.max_velocity)
+        self._read(*self.physics.step(command))
         terminated = self.task.success(self.distance)
-        reward = self.task.reward(self.distance, terminated)
+        reward = self.task.reward(self.distance, terminated).astype(np.float32)
         self.episode_length = self.episode_length + 1
         self.episode_return = self.episode_return + reward
         truncated = (self.episode_length >= self.task.max_steps) & ~terminated
         return reward, terminated, truncated
 
-    def _read(self, joint_position: Any, joint_velocity: Any) -> None:
-        self.joint_position = torch.from_numpy(joint_position).float()
-        self.joint_velocity = torch.from_numpy(joint_velocity).float()
-        self.distance = self.observation.distance(self.joint_position, self.goal)
+    def step_one(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        """Step the only robot: the same as ``step`` and ``observe``, in plain numbers.
+
+        Of one robot, NumPy's calls cost more than what they compute, too.
+
+        Args:
+            action: [n] in [-1, 1].
+
+        Returns:
+            Observation [2n + 4], reward, terminated, truncated, and ``is_success`` and ``distance`` (m).
+        """
+        fastest = self.config.max_velocity
+        command = [min(max(share, -1.0), 1.0) * fastest for share in action.tolist()]
+        joint_position, joint_velocity = self.physics.step(np.array([command]))
+        (position,), (velocity,), (goal,) = joint_position.tolist(), joint_velocity.tolist(), self.goal.tolist()
+        tip = self._tip(position, math)
+        distance = math.dist(tip, goal)
+        terminated = self.task.success(distance)
+        reward = self.task.reward(distance, terminated)
+        length = int(self._episode_length[0][0]) + 1
+        episode_return = float(self._episode_return[0][0]) + reward
+        self._joint_position, self._joint_velocity, self._end_effector = joint_position, joint_velocity, [tip]
+        self._distance, self._episode_length, self._episode_return = [[distance]], [[length]], [[episode_return]]
+        observation = np.array(self.task.observe(self._continuous, position, velocity, tip, goal), np.float32)
+        truncated = length >= self.task.max_steps and not terminated
+        return observation, reward, terminated, truncated, {"is_success": terminated, "distance": distance}
+
+    def observe(self) -> np.ndarray:
+        """Return what a policy sees of the true state, [N, 2n + 4]: the same as the module ``observation`` makes."""
+        columns = self.joint_position.T.astype(float), self.joint_velocity.T, self.end_effector.T, self.goal.T
+        return np.stack(self.task.observe(self._continuous, *columns), axis=1, dtype=np.float32)
+
+    def _read(self, joint_position: np.ndarray, joint_velocity: np.ndarray) -> None:
+        self.joint_position = joint_position.astype(np.float32)
+        self.joint_velocity = joint_velocity.astype(np.float32)
+        self.end_effector = np.stack(self._tip(joint_position.T, np), axis=1, dtype=np.float32)
+        error = self.end_effector - self.goal
+        self.distance = np.hypot(error[:, :1], error[:, 1:])
 
     def state(self) -> dict[str, Tensor]:
         """Return everything that ``set_state`` of an equal simulation needs to go on bit for bit."""
-        physics = {f"physics.{key}": torch.from_numpy(value) for key, value in self.physics.state().items()}
+        arrays = {f"physics.{key}": value for key, value in self.physics.state().items()}
+        arrays |= {key: getattr(self, key) for key in _STATE}
         return {
-            **physics,
-            "goal": self.goal,
-            "episode_length": self.episode_length,
-            "episode_return": self.episode_return,
-            "parameters": self.parameters,
+            **{key: torch.from_numpy(value) for key, value in arrays.items()},
             "generator": self.generator.get_state(),
         }
 
@@ -141,8 +200,8 @@ class Simulation:
         """Restore what ``state`` returned."""
         prefix = "physics."
         self.physics.set_state({k.removeprefix(prefix): v.numpy() for k, v in state.items() if k.startswith(prefix)})
-        self.goal, self.parameters = state["goal"], state["parameters"]
-        self.episode_length, self.episode_return = state["episode_length"], state["episode_return"]
+        for key in _STATE:
+            setattr(self, key, state[key].numpy())
         self.generator.set_state(state["generator"])
         self._read(*self.physics.joint_state())
 
@@ -155,3 +214,9 @@ class Simulation:
     def close(self) -> None:
         """Free the physics engine."""
         self.physics.close()
+
+
+def _replaced(array: np.ndarray, rows: np.ndarray, values: np.ndarray | float) -> np.ndarray:
+    changed = array.copy()
+    changed[rows] = values
+    return changed

@@ -40,7 +40,7 @@ class ParameterLayout:
             self.labels += [name] if len(value) == 1 else [f"{name}[{part}]" for part in of]
         self.nominal: Tensor = torch.from_numpy(np.concatenate(list(rows.values()))).float()
 
-    def dynamics(self, parameters: Tensor) -> DynamicsParameters:
+    def dynamics(self, parameters: np.ndarray) -> DynamicsParameters:
         """Split rows [r, P] into what the physics engine takes."""
-        values = parameters.double().numpy()
+        values = parameters.astype(np.float64)
         return {name: values[:, self.columns[name]] for name in self._dynamics}

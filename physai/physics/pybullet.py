@@ -3,6 +3,7 @@
 import tempfile
 import weakref
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -63,10 +64,12 @@ class PyBulletPhysics:
         self._links: list[int] = links
         self._unit_inertia = masses
         self._tip = spec.moving_links.index(spec.end_effector)
-        self._motors = [[(body, joint) for body in world.bodies for joint in joints] for world in self._worlds]
         self._row = [(world.client, body) for world in self._worlds for body in world.bodies]
         n = len(joints)
-        self._position, self._velocity = np.zeros((num_robots, n)), np.zeros((num_robots, n))
+        # Of all joints of all robots, in lists: what PyBullet takes and gives are single numbers.
+        self._position, self._velocity = [0.0] * (num_robots * n), [0.0] * (num_robots * n)
+        # Body, joint, effort to speed up and to brake with, gain.
+        self._motors = [(body, joint, 0.0, 0.0, 0.0) for _, body in self._row for joint in joints]
         self._parameters = {key: np.repeat(value, num_robots, axis=0) for key, value in nominal_dynamics(spec).items()}
         self.reset(
             np.arange(num_robots),
@@ -83,9 +86,10 @@ class PyBulletPhysics:
         parameters: DynamicsParameters | None = None,
     ) -> None:
         """See :meth:`physai.physics.Physics.reset`."""
-        self._position[rows], self._velocity[rows] = joint_position, joint_velocity
+        n = len(self._joints)
         for row, q, qd in zip(rows.tolist(), joint_position.tolist(), joint_velocity.tolist(), strict=True):
             client, body = self._row[row]
+            self._position[row * n : (row + 1) * n], self._velocity[row * n : (row + 1) * n] = q, qd
             for joint, position, velocity in zip(self._joints, q, qd, strict=True):
                 bullet.resetJointState(body, joint, position, velocity, client)
         if parameters is not None:
@@ -109,40 +113,42 @@ class PyBulletPhysics:
                 )
             for joint, value in zip(self._joints, dampings, strict=True):
                 bullet.changeDynamics(body, joint, jointDamping=value, physicsClientId=client)
+        limit, friction, gain = (
+            self._parameters[key][rows] for key in ("effort_limit", "joint_friction", "velocity_gain")
+        )
+        speeding, braking = np.maximum(limit - friction, 0.0), np.maximum(limit + friction, 0.0)
+        n = len(self._joints)
+        for row, *values in zip(rows.tolist(), speeding.tolist(), braking.tolist(), gain.tolist(), strict=True):
+            bodies = [self._row[row][1]] * n
+            self._motors[row * n : (row + 1) * n] = zip(bodies, self._joints, *values, strict=True)
 
     def step(self, velocity_command: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """See :meth:`physai.physics.Physics.step`."""
         # One flat pass over all joints of all robots: this loop is what collection costs most.
-        commands = zip(
-            velocity_command.ravel().tolist(),
-            self._available_effort(velocity_command).ravel().tolist(),
-            self._parameters["velocity_gain"].ravel().tolist(),
-            strict=True,
-        )
+        commands = zip(self._motors, velocity_command.ravel().tolist(), self._velocity, strict=True)
         command, step, read = bullet.setJointMotorControl2, bullet.stepSimulation, bullet.getJointStates
         mode, joints = bullet.VELOCITY_CONTROL, self._joints
-        flat: list[float] = []
-        for world, motors in zip(self._worlds, self._motors, strict=True):
+        positions: list[float] = []
+        velocities: list[float] = []
+        for world in self._worlds:
             client = world.client
-            for (body, joint), (target, effort, gain) in zip(motors, commands, strict=False):
+            motors = islice(commands, len(world.bodies) * len(joints))
+            for (body, joint, speeding, braking, gain), target, velocity in motors:
+                effort = braking if (target - velocity) * velocity < 0.0 else speeding
                 command(body, joint, mode, 0.0, target, effort, 0.1, gain, 0.0, client)
             for _ in range(self.substeps):
                 step(client)
             for body in world.bodies:
-                for state in read(body, joints, client):
-                    flat += state[:2]
-        state = np.array(flat).reshape(self.num_robots, len(joints), 2)
-        self._position, self._velocity = state[..., 0].copy(), state[..., 1].copy()
+                for position, velocity, _, _ in read(body, joints, client):
+                    positions.append(position)
+                    velocities.append(velocity)
+        self._position, self._velocity = positions, velocities
         return self.joint_state()
-
-    def _available_effort(self, command: np.ndarray) -> np.ndarray:
-        limit, friction = self._parameters["effort_limit"], self._parameters["joint_friction"]
-        braking = (command - self._velocity) * self._velocity < 0
-        return np.maximum(limit + np.where(braking, friction, -friction), 0.0)
 
     def joint_state(self) -> tuple[np.ndarray, np.ndarray]:
         """See :meth:`physai.physics.Physics.joint_state`."""
-        return self._position.copy(), self._velocity.copy()
+        shape = self.num_robots, len(self._joints)
+        return np.fromiter(self._position, float).reshape(shape), np.fromiter(self._velocity, float).reshape(shape)
 
     def parameters(self) -> DynamicsParameters:
         """Masses and damping as PyBullet holds them; the rest as every step hands it to the motors."""
@@ -158,9 +164,10 @@ class PyBulletPhysics:
 
     def state(self) -> dict[str, np.ndarray]:
         """See :meth:`physai.physics.Physics.state`."""
+        position, velocity = self.joint_state()
         return {
-            "joint_position": self._position.copy(),
-            "joint_velocity": self._velocity.copy(),
+            "joint_position": position,
+            "joint_velocity": velocity,
             **{key: value.copy() for key, value in self._parameters.items()},
         }
 

@@ -101,8 +101,8 @@ class GaussianActor(TensorDictModuleBase):
         """Act."""
         mean = self.mean(tensordict)
         noise = torch.randn_like(mean) if exploration_type() == ExplorationType.RANDOM else torch.zeros_like(mean)
-        latent = mean + self.log_std.exp() * noise
-        log_prob = (-0.5 * noise.square() - self.log_std - _HALF_LOG_TWO_PI).sum(-1)
+        latent = torch.addcmul(mean, self.log_std.exp(), noise)
+        log_prob = -0.5 * noise.square().sum(-1) - (self.log_std + _HALF_LOG_TWO_PI).sum()
         tensordict.set("action", torch.tanh(latent))
         tensordict.set("latent_action", latent)
         return tensordict.set("action_log_prob", log_prob)

@@ -1,5 +1,8 @@
 """Forward kinematics as a small torch module: one implementation for simulation, policy and robot."""
 
+from types import ModuleType
+from typing import Any
+
 import numpy as np
 import torch
 from torch import Tensor, nn
@@ -56,25 +59,60 @@ class ForwardKinematics(nn.Module):
 
     def forward(self, joint_position: Tensor) -> Tensor:
         """Map joint positions [N, n] in rad to end-effector positions [N, 3] in m."""
-        motions = self._motions(joint_position)
-        point = motions[-1].narrow(1, 0, 4).narrow(2, 3, 1)
-        for motion in motions[-2::-1]:
-            point = torch.bmm(motion.narrow(1, 0, 4), point)
-        return point.narrow(1, 0, 3).squeeze(2)
+        return self.linearize(torch.cos(joint_position), torch.sin(joint_position))[:, :, -1]
 
     @torch.jit.export
-    def linearize(self, joint_position: Tensor) -> Tensor:
-        """Map joint positions [N, n] in rad to [N, 3, n + 1]: the Jacobian in m/rad, then the end effector in m."""
-        motions = self._motions(joint_position)
-        point, slope = motions[-1].narrow(2, 3, 1).split(4, dim=1)
-        columns = torch.cat([slope, point], dim=2)  # [N, 4, slopes of the joints so far + 1]
-        for motion in motions[-2::-1]:
-            moved, slopes = torch.bmm(motion, columns).split(4, dim=1)
-            columns = torch.cat([slopes.narrow(2, -1, 1), moved], dim=2)
-        return columns.narrow(1, 0, 3)
+    def linearize(self, cosine: Tensor, sine: Tensor) -> Tensor:
+        """Map cosines and sines of joint positions, [N, n] each, to position and slopes.
 
-    def _motions(self, joint_position: Tensor) -> list[Tensor]:
-        """M and its derivative for each joint: n of [N, 8, 4]."""
-        angle = joint_position.unsqueeze(-1).unsqueeze(-1)
-        motion = torch.addcmul(self.constant, self.cosine, torch.cos(angle))
-        return list(torch.addcmul(motion, self.sine, torch.sin(angle)).unbind(1))
+        Returns:
+            [N, 3, n + 1]: the Jacobian in m/rad, then the end effector in m.
+        """
+        cosine, sine = cosine.unsqueeze(-1).unsqueeze(-1), sine.unsqueeze(-1).unsqueeze(-1)
+        motion = torch.addcmul(torch.addcmul(self.constant, self.cosine, cosine), self.sine, sine)  # [N, n, 8, 4]
+        last = motion.shape[1] - 1
+        columns = torch.stack([motion[:, last, 4:, 3], motion[:, last, :4, 3]], dim=2)
+        for joint in range(last - 1, -1, -1):
+            moved = torch.bmm(motion[:, joint], columns)  # [N, 8, slopes of the joints so far + 1]
+            columns = torch.cat([moved[:, 4:, -1:], moved[:, :4]], dim=2)
+        return columns[:, :3]
+
+
+class TipPosition:
+    """What :class:`ForwardKinematics` says of the end effector's place in the plane, without torch.
+
+    At every step of a simulation, calling torch costs more than what it computes. The matrices are those of the module;
+    only their product is written again, for one arm in plain numbers as for many in arrays.
+
+    Args:
+        kinematics: The module.
+    """
+
+    def __init__(self, kinematics: ForwardKinematics) -> None:
+        terms = [kinematics.constant, kinematics.cosine, kinematics.sine]
+        *before, last = np.stack([term[:, :3].double().numpy() for term in terms], axis=1)  # n of [3 terms, 3, 4]
+        rows = [last[:, :, 3].T.tolist()]  # of the last joint, what the three terms make of the tip
+        for terms in before[::-1]:
+            # Of the others, where the joint is, for turning moves no origin, and a row of each of the three matrices.
+            rows.append([(terms[0, row, 3].item(), *terms[:, row, :3].ravel().tolist()) for row in range(3)])
+        del rows[-1][2]  # the height in the end
+        self._tip, *self._joints = rows
+
+    def __call__(self, joint_position: Any, xp: ModuleType) -> list[Any]:
+        """Map n joint positions, rad, to x and y, m.
+
+        Args:
+            joint_position: A list of numbers, or an array [n, ...].
+            xp: Where their ``cos`` and ``sin`` come from: ``math``, or NumPy.
+        """
+        cos, sin = xp.cos, xp.sin
+        c, s = cos(joint_position[-1]), sin(joint_position[-1])
+        point = [a + b * c + d * s for a, b, d in self._tip]
+        for angle, rows in zip(joint_position[-2::-1], self._joints, strict=True):
+            x, y, z = point
+            c, s = cos(angle), sin(angle)
+            point = [
+                at + ax * x + ay * y + az * z + (bx * x + by * y + bz * z) * c + (cx * x + cy * y + cz * z) * s
+                for at, ax, ay, az, bx, by, bz, cx, cy, cz in rows
+            ]
+        return point

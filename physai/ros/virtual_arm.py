@@ -76,9 +76,9 @@ class VirtualArm:
         self.spec = RobotSpec.from_config(config.robot)
         self._physics = PyBulletPhysics(self.spec, 1, period)
         layout = ParameterLayout(self.spec)
-        row = draws.sample(1, layout, torch.Generator().manual_seed(derive(seed, "virtual robot")))
+        row = draws.sample(1, layout, torch.Generator().manual_seed(derive(seed, "virtual robot"))).numpy()
         self._dynamics = layout.dynamics(row)
-        parameters = row[0].double().numpy()
+        parameters = row[0].astype(np.float64)
         self._offset, self._position_noise, self._velocity_noise, delay = (
             parameters[layout.columns[name]]
             for name in ("encoder_offset", "position_noise", "velocity_noise", "actuator_delay")

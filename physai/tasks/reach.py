@@ -1,8 +1,10 @@
 """Reach: bring the end effector to a point of the base frame's x-y plane."""
 
 import math
-from typing import Annotated
+from collections.abc import Iterable
+from typing import Annotated, Any
 
+import numpy as np
 import torch
 from pydantic import Field
 from torch import Tensor, nn
@@ -10,6 +12,9 @@ from torch import Tensor, nn
 from physai.config import Count, NonNegativeFloat, PositiveFloat
 from physai.errors import UserError
 from physai.robots import ForwardKinematics, RobotSpec
+
+Columns = Iterable[Any]
+"""Numbers, or arrays of one shape."""
 
 
 class ReachObservation(nn.Module):
@@ -46,24 +51,15 @@ class ReachObservation(nn.Module):
         Returns:
             Observation [N, 2n + 4] and features [N, 4n + 4].
         """
-        plane = self.kinematics.linearize(joint_position).narrow(1, 0, 2)
-        jacobian, position = plane.split([joint_position.shape[1], 1], dim=2)
-        end_effector = position.squeeze(2)
+        sine, cosine = torch.sin(joint_position), torch.cos(joint_position)
+        plane = self.kinematics.linearize(cosine, sine)[:, :2]
+        end_effector, jacobian = plane[:, :, -1], plane[:, :, :-1]
         error = goal - end_effector
         errors = torch.cat([error, torch.bmm(error.unsqueeze(1), jacobian).squeeze(1)], dim=1)
-        sine, cosine = torch.sin(joint_position), torch.cos(joint_position)
         if self.wraps:
             joint_position = torch.where(self.continuous, torch.atan2(sine, cosine), joint_position)
         observation = torch.cat([joint_position, joint_velocity, end_effector, goal], dim=1)
-        features = torch.cat(
-            [
-                sine,
-                cosine,
-                errors * self.coarse,
-                torch.tanh(errors * self.fine),
-            ],
-            dim=1,
-        )
+        features = torch.cat([sine, cosine, errors * self.coarse, torch.tanh(errors * self.fine)], dim=1)
         return observation, features
 
     @torch.jit.export
@@ -117,23 +113,23 @@ class Reach:
         if len(self.start_spread) != len(spec.joints):
             raise UserError(f"env.task.start_spread has {len(self.start_spread)} values for {len(spec.joints)} joints")
 
-    def sample_goal(self, rows: int, generator: torch.Generator) -> Tensor:
+    def sample_goal(self, rows: int, generator: torch.Generator) -> np.ndarray:
         """Draw goals [rows, 2], m: angle uniform in [0, 2π), radius uniform between the ring's radii."""
-        draw = torch.rand(rows, 2, generator=generator)
+        draw = torch.rand(rows, 2, generator=generator).numpy()
         angle = 2 * math.pi * draw[:, :1]
         inner, outer = self.goal_radius
         radius = inner + (outer - inner) * draw[:, 1:]
-        return radius * torch.cat([torch.cos(angle), torch.sin(angle)], dim=-1)
+        return radius * np.concatenate([np.cos(angle), np.sin(angle)], axis=1)
 
-    def sample_start(self, rows: int, spec: RobotSpec, generator: torch.Generator) -> Tensor:
+    def sample_start(self, rows: int, spec: RobotSpec, generator: torch.Generator) -> np.ndarray:
         """Draw joint positions [rows, n], rad, around the home pose and within the limits."""
         if not any(self.start_spread):
             # Nothing is drawn: a seed gives the same goals to robots one after the other as to robots side by side.
-            return torch.from_numpy(spec.home).repeat(rows, 1)
-        draw = 2 * torch.rand(rows, len(spec.joints), generator=generator, dtype=torch.float64) - 1
-        start = torch.from_numpy(spec.home) + draw * torch.tensor(self.start_spread, dtype=torch.float64)
-        lower, upper = torch.from_numpy(spec.position_limit).T
-        return torch.clamp(start, lower, upper)
+            return np.tile(spec.home, (rows, 1))
+        draw = torch.rand(rows, len(spec.joints), generator=generator, dtype=torch.float64).numpy()
+        start = spec.home + (2 * draw - 1) * np.array(self.start_spread)
+        lower, upper = spec.position_limit.T
+        return np.minimum(np.maximum(start, lower), upper)
 
     def observation(self, spec: RobotSpec, kinematics: ForwardKinematics) -> ReachObservation:
         """Return the module that makes observation and features for a robot."""
@@ -152,10 +148,29 @@ class Reach:
             torch.cat([upper + 0.5, velocity, end_effector, goal]).float(),
         )
 
-    def success(self, distance: Tensor) -> Tensor:
-        """Whether the goal is reached, [N, 1] to [N, 1]."""
+    # What follows is asked at every step: of one robot in plain numbers, of many in arrays.
+
+    def observe(
+        self, continuous: list[int], joint_position: Columns, joint_velocity: Columns, tip: Columns, goal: Columns
+    ) -> Columns:
+        """The observation of :class:`ReachObservation` from the true state, 2n + 4 numbers or arrays.
+
+        Args:
+            continuous: Which joints turn without end.
+            joint_position: n, rad.
+            joint_velocity: n, rad/s.
+            tip: End effector in the plane, 2, m.
+            goal: 2, m.
+        """
+        seen = [*joint_position, *joint_velocity, *tip, *goal]
+        for joint in continuous:
+            seen[joint] = (seen[joint] + math.pi) % (2 * math.pi) - math.pi
+        return seen
+
+    def success(self, distance: Any) -> Any:
+        """Whether the goal is reached."""
         return distance < self.tolerance
 
-    def reward(self, distance: Tensor, success: Tensor) -> Tensor:
-        """Reward of the step that led here, [N, 1]."""
+    def reward(self, distance: Any, success: Any) -> Any:
+        """Reward of the step that led here."""
         return self.success_reward * success - distance

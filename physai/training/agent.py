@@ -3,6 +3,7 @@
 import hashlib
 import logging
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ from hydra.utils import instantiate
 from tensordict.nn import TensorDictModuleBase
 
 from physai.algorithms import OnPolicy
-from physai.collectors import RobotCollector, make_collector
+from physai.collectors import RobotCollector, RobotMultiCollector, make_collector
 from physai.envs.make import TransformedRobotEnv, make_env
 from physai.errors import UserError
 from physai.physics import RandomizationConfig
@@ -31,7 +32,7 @@ class Agent:
     actor: TensorDictModuleBase
     critic: TensorDictModuleBase
     algorithm: OnPolicy
-    collector: RobotCollector
+    collector: RobotCollector | RobotMultiCollector
 
     @classmethod
     def build(cls, config: TrainConfig) -> "Agent":
@@ -47,13 +48,8 @@ class Agent:
             )
         torch.set_num_threads(config.threads)
         torch.manual_seed(derive(config.seed, "learner"))
-        env = make_env(
-            config.env,
-            config.randomization,
-            config.normalization,
-            config.collector.num_envs,
-            derive(config.seed, "train"),
-        )
+        make_robots = partial(make_env, config.env, config.randomization, config.normalization)
+        env = make_robots(config.collector.robots_here, derive(config.seed, "train"))
         actor = make_actor(config, env)
         inputs = input_size(env.observation_spec, config.policy.critic["in_keys"], "policy.critic")
         critic = _make("policy.critic", config.policy.critic, in_features=inputs)
@@ -64,7 +60,7 @@ class Agent:
             critic=critic,
             frames_per_batch=config.collector.frames_per_batch,
         )
-        collector = make_collector(config.collector, env, actor, config.total_frames)
+        collector = make_collector(config.collector, env, make_robots, actor, config.total_frames, config.seed)
         return cls(env, actor, critic, algorithm, collector)
 
     def weights_sha256(self) -> str:

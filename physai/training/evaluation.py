@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 
 import torch
-from scipy.stats import binomtest
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs.utils import ExplorationType, set_exploration_type
@@ -37,6 +36,8 @@ class Evaluation:
     @property
     def success_ci(self) -> tuple[float, float]:
         """95 % confidence interval of the success rate (Wilson, 1927)."""
+        from scipy.stats import binomtest  # takes half a second to import: nobody waits for it before the first frame
+
         interval = binomtest(int(self.success.sum()), len(self.success)).proportion_ci(method="wilson")
         return float(interval.low), float(interval.high)
 
@@ -81,6 +82,6 @@ def _one_round(policy: TensorDictModuleBase, env: TransformedRobotEnv) -> tuple[
             finished |= now
             success[now] = tensordict.get("terminated")[now, 0]
             length[now] = tensordict.get("episode_length")[now, 0]
-            distance[now] = env.simulation.distance[now, 0]
+            distance[now] = torch.from_numpy(env.simulation.distance)[now, 0]
             episode_return[now] = tensordict.get("episode_return")[now, 0]
     return success, length, distance, episode_return

@@ -20,7 +20,7 @@ from physai.seeding import derive
 from physai.training import checkpoint
 from physai.training.agent import Agent, make_evaluation_env, make_logger
 from physai.training.config import TrainConfig
-from physai.training.evaluation import Evaluation, evaluate
+from physai.training.evaluation import MAX_ROBOTS, Evaluation, evaluate
 from physai.training.logs import RunLog
 from physai.training.progress import Progress
 
@@ -46,7 +46,9 @@ class Interrupted(Exception):  # noqa: N818
         self.exit_code = 128 + signal_number
 
 
-def train(config: TrainConfig, run_dir: Path, resume: bool, stop: Sequence[int] = ()) -> tuple[Agent, Clock]:
+def train(
+    config: TrainConfig, run_dir: Path, resume: bool, stop: Sequence[int] = (), agent: Agent | None = None
+) -> tuple[Agent, Clock]:
     """Train until ``total_frames``, or go on from the last checkpoint in ``run_dir``.
 
     Args:
@@ -54,6 +56,7 @@ def train(config: TrainConfig, run_dir: Path, resume: bool, stop: Sequence[int] 
         run_dir: Where checkpoints and logs go.
         resume: Whether to go on.
         stop: From ``stop_signals``; when it fills, the iteration is finished and saved.
+        agent: Just built from ``config``, if it has been already.
 
     Returns:
         The trained agent, to be closed by the caller, and the clock at the end.
@@ -62,7 +65,7 @@ def train(config: TrainConfig, run_dir: Path, resume: bool, stop: Sequence[int] 
         Interrupted: After SIGINT or SIGTERM, when the iteration is done and saved.
         UserError: If the disk is full or a number is not finite; the last good checkpoint is kept.
     """
-    agent = Agent.build(config)
+    agent = agent or Agent.build(config)
     folder = checkpoint.CheckpointFolder(run_dir / "checkpoints", config.checkpoint.keep)
     clock, logged = Clock(), None
     try:
@@ -86,7 +89,7 @@ def _run(
     folder: checkpoint.CheckpointFolder,
     stop: Sequence[int],
 ) -> None:
-    judge = make_evaluation_env(config, config.evaluation.randomization, config.evaluation.goals, EVALUATION_SEED)
+    judge = _Judge(config)
     log = RunLog(run_dir, make_logger(config, run_dir), logged)
     progress = Progress(config.total_frames, clock.frames)
     try:
@@ -113,7 +116,7 @@ def _run(
 def _loop(
     config: TrainConfig,
     agent: Agent,
-    judge: TransformedRobotEnv,
+    judge: "_Judge",
     clock: Clock,
     log: RunLog,
     folder: checkpoint.CheckpointFolder,
@@ -143,7 +146,7 @@ def _loop(
         }
         done = clock.frames >= config.total_frames
         if done or _due(first_frame, clock.frames, config.evaluation.every_frames):
-            result = _evaluate(config, agent, judge, clock, folder)
+            result = _evaluate(agent, judge, clock, folder)
             values |= {f"evaluation/{key}": value for key, value in result.items() if isinstance(value, float)}
         saving = time.perf_counter()
         log.metrics(clock.frames, clock.iteration, values)
@@ -151,6 +154,26 @@ def _loop(
             _save(agent, clock, log, folder)
         clock.seconds += time.perf_counter() - saving
         progress.update(clock.frames, clock.frames / clock.seconds, values)
+
+
+class _Judge:
+    """Judges a policy on the same goals every time; its robots are built when it first does: frames need not wait."""
+
+    def __init__(self, config: TrainConfig) -> None:
+        self._config = config
+        self._env: TransformedRobotEnv | None = None
+
+    def __call__(self, agent: Agent) -> Evaluation:
+        settings = self._config.evaluation
+        if self._env is None:
+            robots = min(settings.goals, MAX_ROBOTS)
+            self._env = make_evaluation_env(self._config, settings.randomization, robots, EVALUATION_SEED)
+        self._env.normalization.load_state_dict(agent.env.normalization.state_dict())
+        return evaluate(agent.actor, self._env, settings.goals, EVALUATION_SEED)
+
+    def close(self) -> None:
+        if self._env is not None:
+            self._env.close()
 
 
 def _due(before: int, after: int, every: int) -> bool:
@@ -164,15 +187,13 @@ def _check_finite(batch: TensorDictBase) -> None:
 
 
 def _evaluate(
-    config: TrainConfig,
     agent: Agent,
-    judge: TransformedRobotEnv,
+    judge: "_Judge",
     clock: Clock,
     folder: checkpoint.CheckpointFolder,
 ) -> dict[str, Any]:
     """Judge the policy, and keep it if it is the best so far: by success rate, then by return."""
-    judge.normalization.load_state_dict(agent.env.normalization.state_dict())
-    result: Evaluation = evaluate(agent.actor, judge, config.evaluation.goals, EVALUATION_SEED)
+    result = judge(agent)
     summary = result.summary()
     score = [result.success_rate, float(result.episode_return.mean())]
     if score >= clock.best or not folder.best.is_file():
@@ -198,6 +219,7 @@ def _restore(agent: Agent, content: dict[str, Any]) -> tuple[Clock, dict[str, An
     try:
         agent.algorithm.set_state(content["algorithm"])
         agent.collector.set_state(content["collector"])
+        agent.env.normalization.load_state_dict(content["normalization"])  # robots in other processes bring none along
         torch.set_rng_state(content["random"])
         return Clock(**content["clock"]), content["log"]
     except (RuntimeError, KeyError, TypeError, ValueError) as error:

@@ -15,7 +15,6 @@ from physai.envs.make import TransformedRobotEnv
 from physai.envs.simulation import EnvConfig
 from physai.errors import UserError
 from physai.physics import RandomizationConfig
-from physai.plotting import plot_runs
 from physai.seeding import derive
 from physai.training import checkpoint
 from physai.training.agent import Agent, load_policy_state, make_actor, make_evaluation_env
@@ -45,8 +44,17 @@ def load_config(run_dir: Path) -> TrainConfig:
         raise UserError(f"{path}: the run's config is damaged or from another version: {error}") from None
 
 
-def run_training(config: TrainConfig, run_dir: Path, resume: bool = False) -> dict[str, Any]:
-    """Train in ``run_dir`` and write ``summary.json`` and ``training.png``; return the summary."""
+def run_training(
+    config: TrainConfig, run_dir: Path, resume: bool = False, agent: Agent | None = None
+) -> dict[str, Any]:
+    """Train in ``run_dir`` and write ``summary.json`` and ``training.png``; return the summary.
+
+    Args:
+        config: The run.
+        run_dir: Where everything goes.
+        resume: Whether to go on with an interrupted run.
+        agent: Just built from ``config``, if it has been already; it is closed at the end.
+    """
     done = run_dir / "summary.json"
     if resume and done.is_file():
         print(f"{run_dir} is complete already.")
@@ -54,7 +62,7 @@ def run_training(config: TrainConfig, run_dir: Path, resume: bool = False) -> di
         print_summary(summary, f"{run_dir}")
         return summary
     with stop_signals() as stop:
-        agent, clock = train(config, run_dir, resume, stop)
+        agent, clock = train(config, run_dir, resume, stop, agent)
         print(f"Judging the best policy on {config.evaluation.episodes:,} goals it has never seen ...", flush=True)
         try:
             result = TrainedPolicy(run_dir, "best").evaluate(config.evaluation.episodes)
@@ -62,6 +70,8 @@ def run_training(config: TrainConfig, run_dir: Path, resume: bool = False) -> di
         finally:
             agent.close()
         checkpoint.write(done, json.dumps(summary, indent=2).encode())
+        from physai.plotting import plot_runs  # no frame needs to wait for Matplotlib
+
         try:
             plot_runs([run_dir], run_dir / "training.png")
         except UserError as error:

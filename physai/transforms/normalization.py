@@ -59,15 +59,14 @@ class ObservationNormalization(Transform):
         batch = observation.reshape(-1, observation.shape[-1]).double()
         count = self.count + len(batch)
         variance, mean = torch.var_mean(batch, dim=0, unbiased=False)
-        if self.count == 0:
-            self.mean, self.variance = mean, variance
-        else:
+        if self.count > 0:
             delta, share = mean - self.mean, len(batch) / count
-            self.mean = self.mean + delta * share
-            self.variance = self.variance * (1 - share) + variance * share + delta.square() * share * (1 - share)
-        self.count = count
-        self.normalizer.loc = self.mean.float()
-        self.normalizer.scale = self.variance.sqrt().float().clamp(min=self.eps)
+            variance = self.variance * (1 - share) + variance * share + delta.square() * share * (1 - share)
+            mean = self.mean + delta * share
+        self.count, self.mean, self.variance = count, mean, variance
+        # In place: other processes may look on.
+        self.normalizer.loc.copy_(mean)
+        self.normalizer.scale.copy_(variance.sqrt()).clamp_(min=self.eps)
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         return next_tensordict.set("normalized_observation", self.normalizer(next_tensordict.get("observation")))

@@ -29,8 +29,8 @@ class SensorModel(StochasticTransform):
         parameters = next_tensordict.get("physics_parameters")
         position, velocity = next_tensordict.get("joint_position"), next_tensordict.get("joint_velocity")
         noise = torch.randn(2, *position.shape, generator=self.generator)
-        position = position + parameters[:, self._offset] + parameters[:, self._position_noise] * noise[0]
-        velocity = velocity + parameters[:, self._velocity_noise] * noise[1]
+        position = torch.addcmul(position + parameters[:, self._offset], parameters[:, self._position_noise], noise[0])
+        velocity = torch.addcmul(velocity, parameters[:, self._velocity_noise], noise[1])
         return next_tensordict.set("joint_position", position).set("joint_velocity", velocity)
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:

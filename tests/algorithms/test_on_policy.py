@@ -32,7 +32,7 @@ class ReadValue(TensorDictModuleBase):
 
 
 def build(actor, critic, frames, *overrides):
-    node = compose("train", [f"collector.frames_per_batch={frames}", f"algo.buffer.batch_size={frames}", *overrides])
+    node = compose("train", [f"collector.frames_per_batch={frames}", f"algo.minibatch_size={frames}", *overrides])
     return instantiate(node.algo, actor=actor, critic=critic, frames_per_batch=frames, _convert_="all")
 
 
@@ -163,13 +163,13 @@ def test_a_loss_that_is_not_finite_stops_before_the_step_and_hands_over_the_batc
 
 def test_state_continues_bit_for_bit():
     actor, critic, batch = small_batch()
-    algorithm = build(actor, critic, 32, "algo.buffer.batch_size=8")
+    algorithm = build(actor, critic, 32, "algo.minibatch_size=8")
     algorithm.update(batch.clone())
     state, random = algorithm.state(), torch.get_rng_state()
     state = torch.load(_saved(state), weights_only=True)
     expected = algorithm.update(batch.clone())
     other_actor, other_critic, _ = small_batch()
-    other = build(other_actor, other_critic, 32, "algo.buffer.batch_size=8")
+    other = build(other_actor, other_critic, 32, "algo.minibatch_size=8")
     other.set_state(state)
     torch.set_rng_state(random)
     assert other.update(batch.clone()) == expected
@@ -186,7 +186,7 @@ def _saved(state):
 
 def test_a_minibatch_larger_than_the_batch_is_refused():
     actor, critic, _ = small_batch()
-    node = compose("train", ["collector.frames_per_batch=4096", "algo.buffer.batch_size=5000"])
+    node = compose("train", ["collector.frames_per_batch=4096", "algo.minibatch_size=5000"])
     with pytest.raises(Exception, match="minibatch of 5000 is larger") as caught:
         instantiate(node.algo, actor=actor, critic=critic, frames_per_batch=4096, _convert_="all")
     assert isinstance(caught.value.__cause__, UserError)

@@ -5,15 +5,18 @@ import torch
 
 from physai.collectors import CollectorConfig, make_collector
 from physai.envs.make import make
-from physai.errors import UserError
 from physai.policies import GaussianActor
+
+
+def robots(num_envs, seed):
+    return make("reacher", num_envs, seed)
 
 
 def collector(frames=256, total=1024, seed=0):
     torch.manual_seed(0)
-    env = make("reacher", num_envs=16, seed=seed)
     actor = GaussianActor(8, 2, ["normalized_observation"], [16], "torch.nn.Tanh", 1.0)
-    return make_collector(CollectorConfig(num_envs=16, frames_per_batch=frames), env, actor, total)
+    config = CollectorConfig(num_envs=16, frames_per_batch=frames, processes=1)
+    return make_collector(config, robots(16, seed), robots, actor, total, seed)
 
 
 def test_one_set_of_statistics_holds_for_a_whole_batch():
@@ -46,13 +49,6 @@ def test_state_continues_bit_for_bit_in_a_new_collector():
     other.shutdown()
     for key in expected.keys(True, True):
         assert torch.equal(expected[key], got[key]), key
-
-
-def test_a_batch_must_be_whole_steps_of_all_robots():
-    env = make("reacher", num_envs=16)
-    with pytest.raises(UserError, match="multiple of"):
-        make_collector(CollectorConfig(num_envs=16, frames_per_batch=100), env, None, 1000)
-    env.close()
 
 
 def resident_megabytes():

@@ -94,12 +94,11 @@ def test_one_env_and_the_torchrl_env_play_the_same_episode(make):
         action = random.uniform(-1, 1, 2).astype(np.float32)
         observation, reward, terminated, truncated, _ = env.step(action)
         td = batched.step(td.set("action", torch.from_numpy(action)[None]))["next"]
-        np.testing.assert_array_equal(td["observation"][0].numpy(), observation)
-        assert (float(td["reward"]), bool(td["terminated"]), bool(td["truncated"])) == (
-            reward,
-            terminated,
-            truncated,
-        )
+        for key, value in batched.simulation.physics.state().items():
+            np.testing.assert_array_equal(env.unwrapped.simulation.physics.state()[key], value)
+        np.testing.assert_allclose(td["observation"][0].numpy(), observation, rtol=0, atol=1e-6)
+        assert float(td["reward"]) == pytest.approx(reward, abs=1e-6)
+        assert (bool(td["terminated"]), bool(td["truncated"])) == (terminated, truncated)
     batched.close()
 
 
@@ -108,7 +107,7 @@ def test_info_tells_success_and_distance(make):
     observation, info = env.reset(seed=0)
     assert info["is_success"] is False
     assert info["distance"] == pytest.approx(np.linalg.norm(observation[4:6] - observation[6:8]), abs=1e-6)
-    env.unwrapped.simulation.goal = torch.from_numpy(observation[None, 4:6].copy())
+    env.unwrapped.simulation.goal = observation[None, 4:6].copy()
     _, reward, terminated, truncated, info = env.step(np.zeros(2, np.float32))
     assert (terminated, truncated, info["is_success"]) == (True, False, True)
     assert reward == pytest.approx(10.0 - info["distance"])
@@ -131,8 +130,8 @@ def test_a_vector_env_restarts_an_episode_at_the_step_after_its_end(make, name):
     assert first.dtype == np.float32
     assert env.observation_space.contains(first)
     simulation = env.unwrapped.simulation
-    simulation.goal = simulation.goal.clone()
-    simulation.goal[1] = torch.from_numpy(first[1, 4:6].copy())  # the second robot is at its goal
+    simulation.goal = simulation.goal.copy()
+    simulation.goal[1] = first[1, 4:6]  # the second robot is at its goal
     still = np.zeros((4, 2), np.float32)
     go = np.tile(np.array([0.5, 0.0], np.float32), (4, 1))
     terminations, truncations, observations, rewards, infos = [], [], [], [], []
@@ -191,7 +190,7 @@ def test_the_picture_shows_the_goal_where_it_is(make, name):
     simulation = env.unwrapped.simulation
     centres = []
     for goal in ([0.4, 0.0], [0.0, 0.4], [-0.4, 0.0]):
-        simulation.goal = torch.tensor([goal])
+        simulation.goal = np.array([goal], np.float32)
         image = env.render()
         assert image.dtype == np.uint8
         assert image.shape == (360, 480, 3)

@@ -1,9 +1,11 @@
+import math
+
 import numpy as np
 import pybullet as bullet
 import pytest
 import torch
 
-from physai.robots import ForwardKinematics, RobotConfig, RobotSpec
+from physai.robots import ForwardKinematics, RobotConfig, RobotSpec, TipPosition
 
 SEVEN = [f"lbr_iiwa_joint_{number}" for number in range(1, 8)]
 
@@ -53,6 +55,10 @@ def random_positions(rows: int, joints: int, seed: int = 0) -> torch.Tensor:
     return torch.empty(rows, joints).uniform_(-6.0, 6.0, generator=torch.Generator().manual_seed(seed))
 
 
+def linearize(kinematics, joint_position):
+    return kinematics.linearize(torch.cos(joint_position), torch.sin(joint_position))
+
+
 def test_end_effector_is_where_pybullet_has_it_on_a_thousand_poses(spec):
     joint_position = random_positions(1000, len(spec.joints))
     found = ForwardKinematics(spec)(joint_position).numpy()
@@ -96,7 +102,7 @@ def test_any_chain_of_turned_joints_matches_pybullet(tmp_path, seed):
 
 def test_slopes_equal_finite_differences_of_textbook_kinematics(spec):
     joint_position = random_positions(50, len(spec.joints), seed=1)
-    slopes = ForwardKinematics(spec).linearize(joint_position)[:, :, :-1].mT.numpy()
+    slopes = linearize(ForwardKinematics(spec), joint_position)[:, :, :-1].mT.numpy()
     step = 1e-6
     for row, q in enumerate(joint_position.double().numpy()):
         for joint in range(len(spec.joints)):
@@ -108,7 +114,7 @@ def test_slopes_equal_finite_differences_of_textbook_kinematics(spec):
 def test_slopes_equal_the_gradient_and_the_last_column_the_position(spec):
     kinematics = ForwardKinematics(spec).double()
     for q in random_positions(20, len(spec.joints), seed=2).double():
-        columns = kinematics.linearize(q[None])[0]
+        columns = linearize(kinematics, q[None])[0]
         jacobian = torch.autograd.functional.jacobian(lambda q: kinematics(q[None])[0], q)
         torch.testing.assert_close(columns[:, :-1], jacobian, rtol=0, atol=1e-12)
         torch.testing.assert_close(columns[:, -1], kinematics(q[None])[0], rtol=0, atol=1e-12)
@@ -121,9 +127,9 @@ def test_scripted_kinematics_equals_eager_bit_for_bit(spec, rows):
     q = random_positions(rows, len(spec.joints))
     for _ in range(4):  # the profiling executor changes what it runs in the first calls
         assert torch.equal(scripted(q), kinematics(q))
-        assert torch.equal(scripted.linearize(q), kinematics.linearize(q))
+        assert torch.equal(linearize(scripted, q), linearize(kinematics, q))
     assert kinematics(q).shape == (rows, 3)
-    assert kinematics.linearize(q).shape == (rows, 3, len(spec.joints) + 1)
+    assert linearize(kinematics, q).shape == (rows, 3, len(spec.joints) + 1)
 
 
 def test_reach_bounds_the_distance_from_the_first_joint_and_is_attained_by_the_planar_arm(reacher, kuka_reacher):
@@ -136,3 +142,23 @@ def test_reach_bounds_the_distance_from_the_first_joint_and_is_attained_by_the_p
     planar = ForwardKinematics(RobotSpec.from_config(reacher.robot))
     assert planar.reach == pytest.approx(0.55)
     torch.testing.assert_close(planar(torch.zeros(1, 2)), torch.tensor([[0.55, 0.0, 0.0]]))
+
+
+def assert_same_in_numbers_and_arrays(spec):
+    kinematics = ForwardKinematics(spec).double()
+    tip = TipPosition(ForwardKinematics(spec))
+    joint_position = random_positions(200, len(spec.joints), seed=3).double()
+    expected = kinematics(joint_position)[:, :2].numpy()
+    q = joint_position.numpy()
+    np.testing.assert_allclose(np.stack(tip(q.T, np), axis=1), expected, rtol=0, atol=1e-12)
+    np.testing.assert_allclose([tip(row, math) for row in q.tolist()], expected, rtol=0, atol=1e-12)
+
+
+def test_the_tip_s_place_without_torch_is_that_of_the_module(spec):
+    assert_same_in_numbers_and_arrays(spec)
+
+
+@pytest.mark.parametrize("joints", [1, 7])
+def test_the_tip_s_place_without_torch_is_that_of_the_module_for_any_number_of_joints(kuka_reacher, joints):
+    robot = {**kuka_reacher.robot.model_dump(), "joints": SEVEN[:joints], "home": [0.0] * joints}
+    assert_same_in_numbers_and_arrays(RobotSpec.from_config(RobotConfig.model_validate(robot)))

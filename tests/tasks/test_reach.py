@@ -41,12 +41,12 @@ def turning(reacher):
 
 
 def put_goal_at_the_tip(simulation, row):
-    simulation.goal = simulation.goal.clone()
-    simulation.goal[row] = simulation.kinematics(simulation.joint_position)[row, :2]
+    simulation.goal = simulation.goal.copy()
+    simulation.goal[row] = simulation.end_effector[row]
 
 
 def test_goals_lie_in_the_ring_at_a_uniform_angle_and_radius(task):
-    goals = task.sample_goal(5000, torch.Generator().manual_seed(0)).double().numpy()
+    goals = task.sample_goal(5000, torch.Generator().manual_seed(0)).astype(float)
     radius = np.linalg.norm(goals, axis=1)
     angle = np.arctan2(goals[:, 1], goals[:, 0]) % (2 * np.pi)
     assert radius.min() >= 0.3 - 1e-6
@@ -58,7 +58,7 @@ def test_goals_lie_in_the_ring_at_a_uniform_angle_and_radius(task):
 
 def test_the_kuka_s_goals_lie_between_30_and_60_cm(simulate):
     simulation = simulate(name="kuka_reacher", robots=1)
-    radius = simulation.task.sample_goal(1000, torch.Generator().manual_seed(0)).norm(dim=-1)
+    radius = np.linalg.norm(simulation.task.sample_goal(1000, torch.Generator().manual_seed(0)), axis=1)
     assert 0.3 - 1e-6 <= radius.min() < 0.31
     assert 0.59 < radius.max() <= 0.6 + 1e-6
 
@@ -67,20 +67,20 @@ def test_goals_and_starts_follow_the_generator(task, reacher):
     spec = RobotSpec.from_config(reacher.robot)
     for sample in (task.sample_goal, lambda rows, generator: task.sample_start(rows, spec, generator)):
         first, again, other = (sample(16, torch.Generator().manual_seed(seed)) for seed in (1, 1, 2))
-        assert torch.equal(first, again)
-        assert not torch.isclose(first, other).any()
+        np.testing.assert_array_equal(first, again)
+        assert not np.isclose(first, other).any()
 
 
 def test_starts_are_uniform_around_home_and_stay_within_the_joint_limits(any_env):
     spec = RobotSpec.from_config(any_env.robot)
     spread = any_env.task["start_spread"]
     task = Reach([0.3, 0.5], 0.05, 10.0, 200, spread)
-    starts = task.sample_start(4000, spec, torch.Generator().manual_seed(0)).numpy()
+    starts = task.sample_start(4000, spec, torch.Generator().manual_seed(0))
     for joint, width in enumerate(spread):
         expected = stats.uniform(spec.home[joint] - width, 2 * width)
         assert stats.kstest(starts[:, joint], expected.cdf).pvalue > 0.01
     wide = Reach([0.3, 0.5], 0.05, 10.0, 200, [100.0, 100.0])
-    starts = wide.sample_start(100, spec, torch.Generator().manual_seed(0)).numpy()
+    starts = wide.sample_start(100, spec, torch.Generator().manual_seed(0))
     assert (starts >= spec.position_limit[:, 0]).all()
     assert (starts <= spec.position_limit[:, 1]).all()
 
@@ -96,11 +96,13 @@ def test_distance_counts_in_the_plane_only(task, kuka_reacher):
 
 
 def test_reward_and_success_are_the_numbers_of_the_contract(task):
-    distance = torch.tensor([[0.0], [0.03], [0.0499], [0.05], [0.2], [1.08]])
+    distance = np.array([[0.0], [0.03], [0.0499], [0.05], [0.2], [1.08]])
     success = task.success(distance)
     assert success[:, 0].tolist() == [True, True, True, False, False, False]
-    expected = torch.tensor([[10.0], [9.97], [9.9501], [-0.05], [-0.2], [-1.08]])
-    torch.testing.assert_close(task.reward(distance, success), expected)
+    expected = [[10.0], [9.97], [9.9501], [-0.05], [-0.2], [-1.08]]
+    np.testing.assert_allclose(task.reward(distance, success), expected)
+    numbers = [[task.reward(d, task.success(d))] for d in distance[:, 0].tolist()]
+    np.testing.assert_array_equal(task.reward(distance, success), numbers)
 
 
 @pytest.fixture
@@ -148,7 +150,7 @@ def test_observations_have_finite_bounds_that_hold_after_many_turns(task, reache
     assert torch.isfinite(upper).all()
     q = torch.stack([torch.linspace(-1000, 1000, 5000), torch.linspace(-2.6, 2.6, 5000)], dim=1)
     observation, _ = task.observation(spec, kinematics)(
-        q, torch.zeros_like(q), task.sample_goal(5000, torch.Generator())
+        q, torch.zeros_like(q), torch.from_numpy(task.sample_goal(5000, torch.Generator()))
     )
     assert ((lower <= observation) & (observation <= upper)).all()
     assert spec.position_limit[0].tolist() == [-math.inf, math.inf]  # what it says of the robot is left alone
@@ -166,9 +168,9 @@ def test_the_scripted_observation_equals_eager_bit_for_bit(any_env, observe):
 
 def test_the_step_that_reaches_the_goal_and_runs_out_of_time_only_terminates(simulate):
     simulation = simulate("env.task.max_steps=1")
-    simulation.goal = torch.full((4, 2), 9.0)
+    simulation.goal = np.full((4, 2), 9.0, np.float32)
     put_goal_at_the_tip(simulation, 2)
-    reward, terminated, truncated = simulation.step(torch.zeros(4, 2))
+    reward, terminated, truncated = simulation.step(np.zeros((4, 2)))
     assert terminated[:, 0].tolist() == [False, False, True, False]
     assert truncated[:, 0].tolist() == [True, True, False, True]
     assert reward[2] > 9.9
@@ -177,16 +179,16 @@ def test_the_step_that_reaches_the_goal_and_runs_out_of_time_only_terminates(sim
 
 def test_episodes_that_miss_the_goal_are_truncated_after_exactly_200_steps(simulate):
     simulation = simulate()
-    simulation.goal = torch.full((4, 2), 9.0)
-    late = torch.tensor([False, True, False, False])
+    simulation.goal = np.full((4, 2), 9.0, np.float32)
+    late = np.array([False, True, False, False])
     for step in range(1, 241):
-        _, terminated, truncated = simulation.step(torch.zeros(4, 2))
+        _, terminated, truncated = simulation.step(np.zeros((4, 2)))
         assert not terminated.any()
         expected = [step >= 200, step >= 240, step >= 200, step >= 200]
         assert truncated[:, 0].tolist() == expected
         if step == 40:
             simulation.reset(late)
-            simulation.goal = torch.full((4, 2), 9.0)
+            simulation.goal = np.full((4, 2), 9.0, np.float32)
     assert simulation.episode_length[:, 0].tolist() == [240, 200, 240, 240]
 
 
@@ -194,21 +196,100 @@ def test_return_and_length_sum_up_since_the_row_s_own_reset(simulate):
     simulation = simulate()
     rewards = []
     for step in range(10):
-        rewards.append(simulation.step(torch.ones(4, 2))[0])
+        rewards.append(simulation.step(np.ones((4, 2)))[0])
         if step == 5:
-            simulation.reset(torch.tensor([True, False, False, False]))
-    sums = torch.stack([sum(rewards[6:])[0], *sum(rewards)[1:]])
-    torch.testing.assert_close(simulation.episode_return, sums)
+            simulation.reset(np.array([True, False, False, False]))
+    sums = np.stack([sum(rewards[6:])[0], *sum(rewards)[1:]])
+    np.testing.assert_allclose(simulation.episode_return, sums, rtol=1e-5)
     assert simulation.episode_length[:, 0].tolist() == [4, 10, 10, 10]
 
 
 def test_an_action_is_a_share_of_the_greatest_velocity_and_is_clamped(simulate):
     simulation = simulate("env.task.start_spread=[0,0]")
-    action = torch.tensor([[0.5, 0.0], [1.0, 0.0], [3.0, 0.0], [-7.0, 0.0]])
+    action = np.array([[0.5, 0.0], [1.0, 0.0], [3.0, 0.0], [-7.0, 0.0]])
     for _ in range(30):
         simulation.step(action)
-    expected = torch.tensor([1.0, 2.0, 2.0, -2.0])
-    torch.testing.assert_close(simulation.joint_velocity[:, 0], expected, rtol=0, atol=0.02)
+    np.testing.assert_allclose(simulation.joint_velocity[:, 0], [1.0, 2.0, 2.0, -2.0], rtol=0, atol=0.02)
+
+
+def put(simulation, joint_position, joint_velocity, goal):
+    """Bring all robots into a state; numbers that a float32 can hold, for that is what a policy gets."""
+    simulation.goal = np.array(goal, np.float32)
+    rows = np.arange(simulation.num_envs)
+    simulation.physics.reset(
+        rows, *(np.array(value, np.float32).astype(float) for value in (joint_position, joint_velocity))
+    )
+    simulation.set_state(simulation.state())
+
+
+def what_a_policy_sees(simulation):
+    state = simulation.joint_position, simulation.joint_velocity, simulation.goal
+    return simulation.observation(*(torch.from_numpy(value) for value in state))[0].numpy()
+
+
+def assert_same_observation(found, expected, continuous):
+    """Equal to 1e-6; the two ends of half a turn are the same."""
+    difference = found.astype(float) - expected
+    turns = difference[..., : len(continuous)][..., continuous]
+    difference[..., : len(continuous)][..., continuous] = (turns + np.pi) % (2 * np.pi) - np.pi
+    assert np.abs(difference).max() <= 1e-6
+
+
+@pytest.fixture(scope="module")
+def both(env_config):
+    """Four robots of each kind."""
+    made = [Simulation(env_config(name), 4, seed=0) for name in ("reacher", "kuka_reacher")]
+    yield made
+    for simulation in made:
+        simulation.close()
+
+
+def rows_of_two(low, high):
+    return st.lists(st.tuples(*[st.floats(low, high, width=32)] * 2), min_size=4, max_size=4)
+
+
+@given(rows_of_two(-100, 100), rows_of_two(-3, 3), rows_of_two(-1, 1))
+def test_what_a_simulation_observes_is_what_a_policy_sees(both, joint_position, joint_velocity, goal):
+    for simulation in both:
+        put(simulation, joint_position, joint_velocity, goal)
+        found = simulation.observe()
+        assert found.dtype == np.float32
+        assert_same_observation(found, what_a_policy_sees(simulation), simulation.spec.continuous)
+        distance = simulation.observation.distance(*map(torch.from_numpy, (simulation.joint_position, simulation.goal)))
+        np.testing.assert_allclose(simulation.distance, distance.numpy(), rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["reacher", "kuka_reacher"])
+def test_one_robot_in_numbers_does_what_it_does_in_arrays(simulate, name):
+    numbers, arrays = (simulate("env.task.max_steps=40", name=name, robots=1) for _ in range(2))
+    random = np.random.default_rng(0)
+    shares = np.repeat(random.uniform(-2, 2, (20, 2)), 10, axis=0).astype(np.float32)
+    shares[0] = [0.0, np.float32(1.0)]
+    ends = set()
+    for step, action in enumerate(shares):
+        if step == 30:
+            for simulation in (numbers, arrays):
+                put_goal_at_the_tip(simulation, 0)
+        observation, reward, terminated, truncated, info = numbers.step_one(action)
+        rewards, terminations, truncations = arrays.step(action[None])
+        for key, value in arrays.physics.state().items():
+            np.testing.assert_array_equal(numbers.physics.state()[key], value)
+        for key in ("joint_position", "joint_velocity", "episode_length"):
+            np.testing.assert_array_equal(getattr(numbers, key), getattr(arrays, key))
+        for key in ("end_effector", "distance", "episode_return"):
+            found, expected = getattr(numbers, key), getattr(arrays, key)
+            assert found.dtype == expected.dtype
+            np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-6)
+        assert_same_observation(observation, arrays.observe()[0], arrays.spec.continuous)
+        assert reward == pytest.approx(rewards.item(), abs=1e-6)
+        assert (terminated, truncated) == (terminations.item(), truncations.item())
+        assert info == {"is_success": terminated, "distance": pytest.approx(arrays.distance.item(), abs=1e-6)}
+        assert all(type(value) is bool for value in (terminated, truncated, info["is_success"]))
+        ends.add((terminated, truncated))
+        if terminated or truncated:
+            numbers.reset()
+            arrays.reset()
+    assert ends == {(False, False), (True, False), (False, True)}
 
 
 @pytest.mark.parametrize(

@@ -17,7 +17,7 @@ SMALL = (
     "evaluation.episodes=32",
     "collector.num_envs=16",
     "collector.frames_per_batch=1024",
-    "algo.buffer.batch_size=256",
+    "algo.minibatch_size=256",
 )
 
 

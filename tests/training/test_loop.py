@@ -10,6 +10,8 @@ import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from physai.errors import UserError
+from physai.training import loop
+from physai.training.agent import Agent
 from physai.training.checkpoint import load
 from physai.training.loop import train
 from physai.training.run import run_training
@@ -122,6 +124,27 @@ def test_a_stopped_run_saves_says_how_to_go_on_and_goes_on(finished, tmp_path, n
     output = resumed.communicate()[0]
     assert resumed.returncode == 0, output
     assert digest(tmp_path / "run") == digest(finished[0])
+
+
+def test_robots_that_judge_are_built_when_first_needed_and_that_moves_no_random_number():
+    agent = Agent.build(small_config())
+    judge = loop._Judge(small_config())
+    assert judge._env is None
+    before = torch.get_rng_state()
+    first, again = judge(agent), judge(agent)
+    assert torch.equal(torch.get_rng_state(), before)
+    assert torch.equal(first.episode_return, again.episode_return)
+    judge.close()
+    agent.close()
+
+
+def test_more_goals_than_robots_are_judged_in_rounds(monkeypatch):
+    monkeypatch.setattr(loop, "MAX_ROBOTS", 8)
+    agent, judge = Agent.build(small_config()), loop._Judge(small_config("evaluation.goals=20"))
+    assert len(judge(agent).success) == 20
+    assert judge._env.simulation.num_envs == 8
+    judge.close()
+    agent.close()
 
 
 def test_resuming_a_complete_run_shows_its_result(finished, capsys):

@@ -23,16 +23,20 @@ def make_env():
         env.close()
 
 
+def true_state(env):
+    return torch.from_numpy(env.simulation.joint_position), torch.from_numpy(env.simulation.joint_velocity)
+
+
 def played(env, steps):
     """Step with random actions; yield the policy's view after each step, and the true joint state beside it."""
     generator = torch.Generator().manual_seed(1)
     td = env.reset()
-    yield td, env.simulation.joint_position, env.simulation.joint_velocity
+    yield td, *true_state(env)
     for _ in range(steps):
         action = 2 * torch.rand(env.action_spec.shape, generator=generator) - 1
         stepped, td = env.step_and_maybe_reset(td.set("action", action))
         if not stepped["next", "done"].any():
-            yield stepped["next"], env.simulation.joint_position, env.simulation.joint_velocity
+            yield stepped["next"], *true_state(env)
 
 
 def columns(env, td, name):
@@ -85,7 +89,8 @@ def test_reward_and_success_are_those_of_the_true_state(make_env):
     reached = believed = 0
     for _ in range(60):
         stepped = env.step(td.set("action", 2 * torch.rand(256, 2, generator=generator) - 1))["next"]
-        distance = (simulation.kinematics(simulation.joint_position)[:, :2] - simulation.goal).norm(dim=-1)
+        tip = simulation.kinematics(true_state(env)[0])[:, :2]
+        distance = (tip - torch.from_numpy(simulation.goal)).norm(dim=-1)
         success = distance < task.tolerance
         torch.testing.assert_close(stepped["reward"][:, 0], 10.0 * success - distance, rtol=0, atol=1e-5)
         assert torch.equal(stepped["terminated"][:, 0], success)

@@ -1,0 +1,97 @@
+"""What a run costs as it grows: time and memory against frames, and against robots."""
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from argparse import Namespace
+from dataclasses import dataclass
+from pathlib import Path
+
+from rich.table import Table
+
+from physai.bench.timing import reacher, table
+from physai.errors import UserError
+
+FRAMES = (131_072, 262_144, 524_288, 1_048_576, 2_097_152)
+ROBOTS = (64, 128, 256, 512, 1024)
+ROBOTS_FRAMES = 262_144
+
+
+@dataclass(frozen=True)
+class Run:
+    """What one run took: its loop alone, and the most memory that its process ever had."""
+
+    frames: int
+    robots: int
+    seconds: float
+    megabytes: float
+
+
+def run(options: Namespace) -> Table:
+    """Measure, draw it into ``options.figure``, and show it."""
+    series = measure_growth(options.seed)
+    growth_figure(*series, options.figure)
+    print(f"Figure: {options.figure}")
+    return growth_table(*series)
+
+
+def measure_growth(seed: int) -> tuple[list[Run], list[Run]]:
+    """Train with ever more frames, and with ever more robots; each run is a process of its own."""
+    robots = reacher(seed).collector.num_envs
+    by_frames = [_run(frames, robots, seed) for frames in FRAMES]
+    return by_frames, [_run(ROBOTS_FRAMES, robots, seed) for robots in ROBOTS]
+
+
+def _run(frames: int, robots: int, seed: int) -> Run:
+    with tempfile.TemporaryDirectory() as folder:
+        command = [
+            *(sys.executable, "-m", "physai.train", "env=reacher", f"seed={seed}", f"hydra.run.dir={folder}"),
+            *(f"total_frames={frames}", f"collector.num_envs={robots}"),
+            "evaluation.episodes=100",  # the thousand robots of the final evaluation would hide the others
+        ]
+        process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+        said = process.stdout.read() if process.stdout else ""
+        _, status, usage = os.wait4(process.pid, 0)
+        if os.waitstatus_to_exitcode(status):
+            raise UserError(f"training failed: {said[-1000:]}")
+        summary = json.loads((Path(folder) / "summary.json").read_text())
+    run = Run(summary["frames"], robots, summary["train_seconds"], usage.ru_maxrss / 1024)
+    print(f"{run.frames:>9,} frames, {robots:>5,} robots: {run.seconds:6.1f} s, {run.megabytes:,.0f} MB", flush=True)
+    return run
+
+
+def growth_table(by_frames: list[Run], by_robots: list[Run]) -> Table:
+    """Show both series."""
+    shown = table("Training time and peak memory", "frames", "robots", "time", "frames/s", "peak memory")
+    for series in (by_frames, by_robots):
+        for run in series:
+            speed, memory = f"{run.frames / run.seconds:,.0f}", f"{run.megabytes:,.0f} MB"
+            shown.add_row(f"{run.frames:,}", f"{run.robots:,}", f"{run.seconds:.1f} s", speed, memory)
+        shown.add_section()
+    return shown
+
+
+def growth_figure(by_frames: list[Run], by_robots: list[Run], path: Path) -> None:
+    """Draw both series, each from zero: a straight line is linear growth, a level one is none."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(9, 3.2), layout="constrained")
+    sides = zip(figure.subplots(1, 2), (by_frames, by_robots), ("frames", "robots"), strict=True)
+    for axes, runs, name in sides:
+        sizes = [getattr(run, name) for run in runs]
+        axes.plot(sizes, [run.seconds for run in runs], "o-", color="tab:blue")
+        axes.set_xlabel(name if name == "frames" else f"robots ({runs[0].frames:,} frames)")
+        axes.set_ylabel("training time, s", color="tab:blue")
+        axes.set_xlim(left=0)
+        axes.set_ylim(bottom=0, top=1.15 * max(run.seconds for run in runs))
+        memory = axes.twinx()
+        memory.plot(sizes, [run.megabytes / 1024 for run in runs], "s--", color="tab:orange")
+        memory.set_ylabel("peak memory, GB", color="tab:orange")
+        memory.set_ylim(bottom=0, top=1.3 * max(run.megabytes for run in runs) / 1024)
+        axes.xaxis.set_major_formatter(lambda value, _: f"{value / 1e6:g} M" if value >= 1e5 else f"{value:g}")
+        axes.spines["top"].set_visible(False)
+        memory.spines["top"].set_visible(False)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=150)

@@ -1,0 +1,224 @@
+"""Stable-Baselines3's PPO: as it comes, and as fast as we could make it on our robots."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any
+
+import gymnasium
+import numpy as np
+import torch
+from gymnasium import spaces
+from numpy.typing import NDArray
+from stable_baselines3 import PPO
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.logger import Logger
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize
+from torch import Tensor, nn
+
+from physai.bench.timing import median_speeds
+from physai.envs.gym_env import RobotVectorEnv
+
+THREADS = (1, 2)
+SLOWEST_RATE = 0.05  # of the learning rate, when the schedule has come to its end
+
+Array = NDArray[Any]
+
+
+class RobotVecEnv(VecEnv):
+    """N robots in one process, as Stable-Baselines3 wants them: an episode that is over restarts in the same step.
+
+    Args:
+        robots: They belong to this env, and are stepped by it alone.
+        features: Whether the task's features follow the observation.
+    """
+
+    def __init__(self, robots: RobotVectorEnv, features: bool = False) -> None:
+        self.robots, self.simulation, self.features = robots, robots.simulation, features
+        self._turn = np.where(self.simulation.spec.continuous, 2 * np.pi, 0.0).astype(np.float32)
+        self._actions: Array = np.zeros(0)
+        space = robots.single_observation_space
+        assert isinstance(space, spaces.Box)
+        low, high = space.low, space.high
+        if features:
+            self.simulation.reset()
+            room = np.full(self._features().shape[1], np.inf, np.float32)
+            low, high = np.concatenate([low, -room]), np.concatenate([high, room])
+        super().__init__(robots.num_envs, spaces.Box(low, high), robots.single_action_space)
+
+    def reset(self) -> Array:
+        """Start an episode in every row."""
+        if self._seeds[0] is not None:
+            self.simulation.seed(self._seeds[0])
+        self._reset_seeds()
+        self.simulation.reset()
+        return self._observe()
+
+    def step_async(self, actions: Array) -> None:
+        """Take note of the actions."""
+        self._actions = actions
+
+    def step_wait(self) -> tuple[Array, Array, Array, list[dict[str, Any]]]:
+        """Apply the actions; returns observation, reward, done and info, the observation of rows that are done anew."""
+        reward, terminated, truncated = (value[:, 0] for value in self.simulation.step(self._actions))
+        observation, done = self._observe(), terminated | truncated
+        infos: list[dict[str, Any]] = [{}] * self.num_envs  # rows that go on have nothing to say, and share it
+        if done.any():
+            for row in done.nonzero()[0]:
+                infos[row] = {"terminal_observation": observation[row], "TimeLimit.truncated": bool(truncated[row])}
+            self.simulation.reset(done)
+            observation = self._observe()
+        return observation, reward, done, infos
+
+    def _observe(self) -> Array:
+        now = self.simulation
+        # The task's module says the same (a test holds them against each other), and takes longer.
+        turns = np.round(now.joint_position / np.float32(2 * np.pi))
+        parts = [now.joint_position - self._turn * turns, now.joint_velocity, now.end_effector, now.goal]
+        return np.concatenate([*parts, self._features()] if self.features else parts, axis=1)
+
+    def _features(self) -> Array:
+        now = self.simulation
+        sensed = (torch.from_numpy(value) for value in (now.joint_position, now.joint_velocity, now.goal))
+        with torch.no_grad():
+            return now.observation(*sensed)[1].numpy()
+
+    def close(self) -> None:
+        """Free the simulation."""
+        self.robots.close()
+
+    # The robots of a row are no objects of their own.
+
+    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
+        """Return an attribute of the vector env, for each row."""
+        return [getattr(self.robots, attr_name)] * len(list(self._get_indices(indices)))
+
+    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
+        """Refuse."""
+        raise NotImplementedError
+
+    def env_method(self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any) -> list[Any]:
+        """Refuse."""
+        raise NotImplementedError
+
+    def env_is_wrapped(self, wrapper_class: type[gymnasium.Wrapper], indices: Any = None) -> list[bool]:
+        """Whether rows are wrapped: they are not."""
+        return [False] * len(list(self._get_indices(indices)))
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Which env, and what PPO takes.
+
+    Attributes:
+        make_envs: Makes the env.
+        ppo: PPO's arguments.
+        features: Whether the policy is told the task's features, too, as physai's is; this is more than a setting.
+        horizon: Frames until the learning rate has fallen to its end; 0 leaves it as it is.
+        trial: PPO's arguments for the choice of threads, where a batch takes long.
+    """
+
+    make_envs: Callable[[], VecEnv]
+    ppo: dict[str, Any]
+    features: bool = False
+    horizon: int = 0
+    trial: dict[str, Any] = field(default_factory=dict)
+
+
+def _our_envs(num_envs: int, features: bool) -> VecEnv:
+    return VecNormalize(RobotVecEnv(RobotVectorEnv("reacher", num_envs), features), norm_reward=False)
+
+
+DEFAULTS = Settings(
+    partial(make_vec_env, "physai/Reacher-v0", 4),  # a DummyVecEnv
+    # The numbers that users know; all but ent_coef are also PPO's defaults.
+    {
+        "learning_rate": 3e-4,
+        "n_steps": 2048,
+        "batch_size": 64,
+        "n_epochs": 10,
+        "gamma": 0.99,
+        "gae_lambda": 0.95,
+        "clip_range": 0.2,
+        "ent_coef": 0.005,
+        "vf_coef": 0.5,
+        "max_grad_norm": 0.5,
+    },
+    trial={"n_steps": 256},
+)
+# Found by some 100 runs over robots, steps, minibatches, epochs, learning rates, discounts, networks and their
+# activation: what fewer frames need in more gradient steps costs more time than it saves.
+_TUNED: dict[str, Any] = {
+    "learning_rate": 2e-3,
+    "n_steps": 16,
+    "batch_size": 1024,
+    "n_epochs": 5,
+    "gamma": 0.95,
+    "gae_lambda": 0.95,
+    "policy_kwargs": {
+        "net_arch": [64, 64],  # of actor and critic each
+        "activation_fn": nn.ReLU,
+        "optimizer_kwargs": {"eps": 1e-5, "fused": True},
+    },
+}
+TUNED = Settings(partial(_our_envs, 256, features=False), _TUNED, horizon=1_000_000)
+TUNED_WITH_FEATURES = Settings(partial(_our_envs, 256, features=True), _TUNED, features=True, horizon=200_000)
+
+
+class Learner:
+    """PPO, one batch at a time.
+
+    Args:
+        settings: What it is like.
+        seed: Of weights, exploration, minibatches and goals.
+        threads: Of torch.
+        changed: PPO's arguments that differ.
+    """
+
+    def __init__(self, settings: Settings, seed: int, threads: int = 1, **changed: Any) -> None:
+        self.in_keys = ["observation", "features"] if settings.features else ["observation"]
+        self._envs = settings.make_envs()
+        self._horizon, self._threads, self._frames = settings.horizon, threads, 0
+        arguments = settings.ppo | changed
+        self._rate = arguments["learning_rate"]
+        # Torch would check the arguments of every distribution, at every step.
+        torch.distributions.Distribution.set_default_validate_args(False)
+        arguments["learning_rate"] = self._learning_rate
+        self.model = PPO("MlpPolicy", self._envs, seed=seed, device="cpu", **arguments)
+        self.model.set_logger(Logger(None, []))
+
+    def _learning_rate(self, _: float) -> float:
+        # What PPO says of its progress refers to one call of learn(), and each makes one batch here.
+        left = 1.0 - self._frames / self._horizon if self._horizon else 1.0
+        return float(self._rate * max(SLOWEST_RATE, left))
+
+    def learn(self) -> int:
+        """Collect a batch and learn from it; returns its frames."""
+        torch.set_num_threads(self._threads)
+        before = self._frames
+        self.model.learn(1, reset_num_timesteps=False)  # rounds up to one batch
+        self._frames = self.model.num_timesteps
+        return self._frames - before
+
+    def act(self, *seen: Tensor) -> Tensor:
+        """Return the actions of the policy's mode [N, n], told what ``in_keys`` name."""
+        told: Any = torch.cat(seen, dim=1).numpy()
+        if isinstance(self._envs, VecNormalize):
+            told = self._envs.normalize_obs(told)
+        return torch.from_numpy(self.model.predict(told, deterministic=True)[0])
+
+    def close(self) -> None:
+        """Free the robots."""
+        self._envs.close()
+
+
+def fastest_threads(name: str, settings: Settings) -> int:
+    """Measure which number of torch threads learns fastest."""
+    trials = [Learner(settings, 0, threads, **settings.trial) for threads in THREADS]
+    speeds = median_speeds(*(trial.learn for trial in trials), rounds=3)
+    for trial in trials:
+        trial.close()
+    threads = THREADS[speeds.index(max(speeds))]
+    measured = ", ".join(f"{speed:,.0f}/s with {n}" for n, speed in zip(THREADS, speeds, strict=True))
+    print(f"{name}, by torch threads: {measured}; it gets {threads}", flush=True)
+    return threads

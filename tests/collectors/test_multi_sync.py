@@ -1,0 +1,136 @@
+import os
+import signal
+import subprocess
+import sys
+import time
+from itertools import pairwise
+from multiprocessing import active_children
+
+import pytest
+import torch
+
+from physai.collectors import CollectorConfig, make_collector
+from physai.envs.make import make
+from physai.errors import UserError
+from physai.policies import GaussianActor
+
+
+def robots(num_envs, seed):
+    return make("reacher", num_envs, seed)
+
+
+@pytest.fixture
+def collect():
+    """Make a collector of two processes that ends with the test, and what it shares with them."""
+    made = []
+
+    def build(seed=0, total=1024):
+        torch.manual_seed(0)
+        actor = GaussianActor(8, 2, ["normalized_observation"], [16], "torch.nn.Tanh", 1.0)
+        env = robots(1, seed)
+        config = CollectorConfig(num_envs=8, frames_per_batch=128, processes=2)
+        made.append((make_collector(config, env, robots, actor, total, seed), env))
+        return made[-1][0], actor, env.normalization
+
+    yield build
+    for collector, env in made:
+        collector.shutdown()
+        env.close()
+    assert not active_children()
+
+
+def assert_equal(ours, theirs):
+    for key in ours.keys(True, True):
+        assert torch.equal(ours[key], theirs[key]), key
+
+
+def test_batches_are_robots_by_steps_and_no_two_robots_are_alike(collect):
+    source, *_ = collect(total=300)
+    batches = [batch.clone() for batch in source]
+    assert [batch.shape for batch in batches] == [(8, 16)] * 3  # rounded up to whole batches
+    assert len(batches[0]["goal"][:, 0].unique(dim=0)) == 8
+    assert len(batches[0]["latent_action"][:, 0].unique(dim=0)) == 8
+    for before, after in pairwise(batches):  # an episode goes on where the last batch ended
+        goes_on = ~before["next", "done"][:, -1, 0]
+        assert goes_on.any()
+        assert torch.equal(before["next", "observation"][:, -1][goes_on], after["observation"][:, 0][goes_on])
+
+
+def test_all_processes_see_the_learner_s_weights_and_normalization_from_the_next_batch_on(collect):
+    source, actor, normalization = collect()
+    batches = iter(source)
+    for _ in range(4):
+        batch = next(batches)
+        assert torch.equal(batch["normalized_observation"], normalization.normalizer(batch["observation"]))
+        expected = actor.get_dist(batch).log_prob(batch["latent_action"])
+        torch.testing.assert_close(batch["action_log_prob"], expected, rtol=0, atol=1e-5)
+        normalization.update(batch["observation"])
+        with torch.no_grad():
+            for parameter in actor.parameters():
+                parameter.add_(0.1)
+
+
+def test_the_same_seed_gives_the_same_frames(collect):
+    (first, *_), (again, *_), (other, *_) = collect(seed=1), collect(seed=1), collect(seed=2)
+    for ours, theirs, _ in zip(first, again, range(2), strict=False):
+        assert_equal(ours, theirs)
+    assert not torch.isclose(next(iter(other))["goal"], ours["goal"]).any()
+
+
+def test_state_continues_bit_for_bit_in_new_processes(collect):
+    source, _, normalization = collect(seed=3)
+    batches = iter(source)
+    for _ in range(2):
+        normalization.update(next(batches)["observation"])
+    state, statistics = source.state(), normalization.state_dict()
+    expected = next(batches).clone()
+    other, _, fresh = collect(seed=99)
+    fresh.load_state_dict(statistics)
+    other.set_state(state)
+    assert_equal(expected, next(iter(other)))
+
+
+def test_a_killed_worker_ends_collection_with_an_error_and_takes_the_others_along(collect):
+    source, *_ = collect()
+    batches = iter(source)
+    next(batches)
+    os.kill(source.procs[1].pid, signal.SIGKILL)
+    started = time.monotonic()
+    with pytest.raises(UserError, match="worker 1"):
+        list(batches)
+    source.shutdown()
+    assert time.monotonic() - started < 20
+
+
+LEARNER = """
+import time
+from tests.collectors import test_multi_sync as parts
+config = parts.CollectorConfig(num_envs=8, frames_per_batch=128, processes=2)
+actor = parts.GaussianActor(8, 2, ["normalized_observation"], [16], "torch.nn.Tanh", 1.0)
+source = parts.make_collector(config, parts.robots(1, 0), parts.robots, actor, 10**9, 0)
+for _ in source:
+    print(*(process.pid for process in source.procs), flush=True)
+"""
+
+
+def is_alive(pid):
+    try:
+        with open(f"/proc/{pid}/stat") as file:
+            return file.read().rpartition(")")[2].split()[0] != "Z"
+    except FileNotFoundError:
+        return False
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="a signal at the death of the parent is Linux's")
+def test_workers_die_with_a_learner_that_is_killed():
+    learner = subprocess.Popen([sys.executable, "-c", LEARNER], stdout=subprocess.PIPE, text=True)
+    workers = []
+    while len(workers) != 2:
+        workers = [int(word) for word in learner.stdout.readline().split() if word.isdigit()]
+    assert all(is_alive(worker) for worker in workers)
+    learner.kill()
+    learner.communicate()
+    deadline = time.monotonic() + 10
+    while any(is_alive(worker) for worker in workers) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert not any(is_alive(worker) for worker in workers)

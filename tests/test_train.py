@@ -1,0 +1,98 @@
+"""Starting to train: heavy imports only where they are needed, and nothing is built twice."""
+
+import subprocess
+import sys
+
+import pytest
+
+from physai import cli, train
+from physai.config import compose
+from physai.errors import UserError
+from tests.training.small import SMALL
+
+AT_HELP = """
+import sys
+from physai import train
+try:
+    train.main()
+finally:
+    print(sorted({"torch", "torchrl", "pybullet", "scipy", "pandas", "matplotlib"} & set(sys.modules)))
+"""
+
+AT_THE_FIRST_FRAME = """
+import os, sys
+from physai import train
+from physai.training import agent, loop
+
+built = []
+build = agent.Agent.build
+agent.Agent.build = lambda config: built.append(config) or build(config)
+
+def first_frame(*_):
+    print(sorted({"scipy.stats", "matplotlib", "onnx", "onnxruntime"} & set(sys.modules)), len(built))
+    sys.stdout.flush()
+    os._exit(0)
+
+loop._loop = first_frame
+train.main()
+"""
+
+
+def last_line(code, *arguments, cwd):
+    done = subprocess.run([sys.executable, "-c", code, *arguments], cwd=cwd, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return done.stdout.splitlines()[-1]
+
+
+def test_help_imports_nothing_that_trains(tmp_path):
+    assert last_line(AT_HELP, "--help", cwd=tmp_path) == "[]"
+
+
+def test_before_the_first_frame_nothing_is_built_twice_and_nothing_imported_that_draws_or_exports(tmp_path):
+    assert last_line(AT_THE_FIRST_FRAME, *SMALL, "hydra.run.dir=run", cwd=tmp_path) == "[] 1"
+
+
+@pytest.fixture
+def training(monkeypatch):
+    """The command, which notes what it would train instead of training it."""
+    trained = []
+    monkeypatch.setattr(train, "_run", lambda config, run_dir, resume, agent: trained.append(agent))
+    command = train._Training()
+    yield command, trained
+    command.close()
+    for agent in trained:
+        if agent is not None:
+            agent.close()
+
+
+def test_what_was_checked_last_is_what_the_first_job_trains(training, tmp_path):
+    command, trained = training
+    node = compose("train", SMALL)
+    command.check(node)
+    command.train(node, tmp_path)
+    command.train(node, tmp_path)
+    assert trained[0] is not None
+    assert trained[1] is None  # random numbers have been drawn since
+
+
+def test_a_job_is_not_given_what_was_built_from_another_config(training, tmp_path):
+    command, trained = training
+    nodes = [compose("train", [*SMALL, f"seed={seed}"]) for seed in (0, 1)]
+    for node in nodes:
+        command.check(node)
+    for node in nodes:
+        command.train(node, tmp_path)
+    assert trained == [None, None]
+
+
+@pytest.mark.parametrize("error", [None, UserError("no such thing")])
+def test_garbage_is_collected_again_after_the_check(error):
+    import contextlib
+    import gc
+
+    with contextlib.suppress(UserError), cli._imports():
+        assert not gc.isenabled()
+        if error is not None:
+            raise error
+    assert gc.isenabled()
+    gc.unfreeze()
