@@ -1,5 +1,6 @@
 """``python -m physai.train``: train a policy (see ``--help``)."""
 
+import gc
 import sys
 from contextlib import closing
 from pathlib import Path
@@ -62,6 +63,7 @@ class _Training:
         if self._agent is not None:
             self._agent.close()
             self._agent = None
+            gc.collect()  # its parts know each other, and the next config's are as many
 
 
 def _resume(run_dir: Path, given: list[str]) -> None:

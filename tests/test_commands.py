@@ -77,7 +77,15 @@ BAD_TRAINING = {
         ["collector.frames_per_batch=0"],
         "collector.frames_per_batch: input should be greater than 0",
     ),
-    "uneven batch": (["collector.frames_per_batch=2000"], "must be a multiple of collector.num_envs (256)"),
+    "uneven batch": (
+        ["collector.num_envs=256", "collector.frames_per_batch=2000"],
+        "must be a multiple of collector.num_envs (256)",
+    ),
+    "uneven processes": (
+        ["collector=multi_sync", "collector.num_envs=255"],
+        "collector.num_envs (255) must be a multiple of collector.processes (2)",
+    ),
+    "minibatch of the buffer": (["algo.buffer.batch_size=256"], "minibatches are algo.minibatch_size"),
     "minibatch too large": (["algo.minibatch_size=5000"], "a minibatch of 5000 is larger than a batch"),
     "zero minibatch": (["algo.minibatch_size=0"], "algo.minibatch_size: input should be greater than 0, got 0"),
     "existing key with +": (["+total_frames=5"], "'total_frames' exists already: change it without the +"),

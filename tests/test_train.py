@@ -85,6 +85,15 @@ def test_a_job_is_not_given_what_was_built_from_another_config(training, tmp_pat
     assert trained == [None, None]
 
 
+def test_a_sweep_s_check_keeps_the_robots_of_one_combination_at_most(training):
+    command, _ = training
+    physics = []
+    for seed in range(3):
+        command.check(compose("train", [*SMALL, f"seed={seed}"]))
+        physics.append(command._agent.env.simulation.physics)
+    assert [len(engine._worlds) for engine in physics] == [0, 0, 1]
+
+
 @pytest.mark.parametrize("error", [None, UserError("no such thing")])
 def test_garbage_is_collected_again_after_the_check(error):
     import contextlib

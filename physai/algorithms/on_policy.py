@@ -72,6 +72,12 @@ class OnPolicy:
                 f"algo.minibatch_size: a minibatch of {minibatch_size} is larger than a batch, "
                 f"collector.frames_per_batch={frames_per_batch}"
             )
+        drawn, held = buffer.batch_size, buffer.storage.max_size
+        if drawn != frames_per_batch or held < frames_per_batch:
+            raise UserError(
+                f"algo.buffer: batch_size ({drawn}) and storage.max_size ({held}) must be "
+                f"collector.frames_per_batch ({frames_per_batch}); minibatches are algo.minibatch_size"
+            )
         self.loss = loss(actor_network=actor, critic_network=critic)
         self.advantage = advantage(value_network=critic)
         for where, module in (("loss", self.loss), ("advantage", self.advantage)):
@@ -83,7 +89,8 @@ class OnPolicy:
         self.minibatch_size = minibatch_size
         # What comes after a frame has done its part once there are advantages; each key is gathered in each epoch.
         now = [key for key in self.loss.in_keys if not (isinstance(key, tuple) and key[0] == "next")]
-        self._keys = [*now, "advantage", "value_target"]
+        self._judged = self.advantage.tensor_keys.value, self.advantage.tensor_keys.value_target
+        self._keys = [*now, self.advantage.tensor_keys.advantage, *self._judged]
         self._parameters = list(self.loss.parameters())  # finding them takes longer than clipping them
         self.optimizer = optimizer(self._parameters)
         self.scheduler = scheduler(self.optimizer) if scheduler is not None else None
@@ -115,7 +122,7 @@ class OnPolicy:
         with torch.no_grad():
             means: TensorDictBase = torch.stack(results).mean(dim=0)
             metrics = {key: float(value) for key, value in means.items()}
-            metrics["explained_variance"] = _explained_variance(batch.get("state_value"), batch.get("value_target"))
+            metrics["explained_variance"] = _explained_variance(*(batch.get(key) for key in self._judged))
         metrics["lr"] = self.optimizer.param_groups[0]["lr"]
         if self.scheduler is not None:
             self.scheduler.step()

@@ -8,6 +8,7 @@ from pathlib import Path
 from rich.console import Console
 
 from physai import cli
+from physai.artifact import onnx
 from physai.bench.timing import machine
 from physai.errors import UserError
 
@@ -22,11 +23,11 @@ PARTS = {
     "training": "time to 99 percent of unseen goals, against Stable-Baselines3 PPO",
     "growth": "time and memory of training against frames and robots",
 }
-NEEDS = {  # the extra that a part needs, and a module of it
-    "policy": ("onnx", "onnxruntime"),
-    "ros": ("ros", "rclpy"),
-    "gym": ("bench", "stable_baselines3"),
-    "training": ("bench", "stable_baselines3"),
+NEEDS = {  # the extra that a part needs, and its modules
+    "policy": ("onnx", onnx.PACKAGES),
+    "ros": ("ros", ["rclpy"]),
+    "gym": ("bench", ["stable_baselines3"]),
+    "training": ("bench", ["stable_baselines3"]),
 }
 
 
@@ -35,9 +36,9 @@ def main() -> None:
     options = _options()
     with cli.guard():
         for part in options.parts:
-            extra, module = NEEDS.get(part, ("", "physai"))
-            if find_spec(module) is None:
-                raise UserError(f"--{part}: no {module} here (pip install 'physai[{extra}]')")
+            extra, modules = NEEDS.get(part, ("", []))
+            if missing := [module for module in modules if find_spec(module) is None]:
+                raise UserError(f"--{part}: no {', '.join(missing)} here (pip install 'physai[{extra}]')")
         print(machine(), flush=True)
         tables = []
         for part in options.parts:

@@ -12,6 +12,7 @@ from physai.bench.timing import median_speeds, reacher, table
 from physai.training.agent import Agent
 
 ROUNDS = 11
+FRAMES = 4096  # in a batch, so that every minibatch fits
 MINIBATCHES = (256, 512, 1024, 2048, 4096)
 
 
@@ -31,11 +32,12 @@ def measure_update(seed: int) -> tuple[int, dict[int, list[float]]]:
 
 
 def _update_speeds(seed: int, minibatch: int) -> list[float]:
-    agent, twin = (Agent.build(reacher(seed, f"algo.minibatch_size={minibatch}")) for _ in range(2))
+    config = reacher(seed, f"algo.minibatch_size={minibatch}", f"collector.frames_per_batch={FRAMES}")
+    agent, twin = Agent.build(config), Agent.build(config)
     try:
         batch = next(iter(agent.collector))
         agent.env.normalization.update(batch.get("observation"))
-        by_hand = plain_ppo(twin, batch, minibatch)
+        by_hand = plain_ppo(twin, batch, minibatch, config.algo["optimizer"]["lr"])
 
         def update() -> int:
             agent.algorithm.update(batch.copy())
@@ -47,13 +49,14 @@ def _update_speeds(seed: int, minibatch: int) -> list[float]:
         twin.close()
 
 
-def plain_ppo(agent: Agent, batch: TensorDictBase, minibatch: int) -> Callable[[], int]:
+def plain_ppo(agent: Agent, batch: TensorDictBase, minibatch: int, lr: float) -> Callable[[], int]:
     """PPO as one writes it for one task: the same networks, numbers and samples, in as little torch as it takes.
 
     Args:
         agent: Its networks learn.
         batch: Frames [N, T].
         minibatch: Samples a step.
+        lr: Learning rate.
 
     Returns:
         A function that learns from the batch once, and says from how many samples, epochs counted.
@@ -62,7 +65,7 @@ def plain_ppo(agent: Agent, batch: TensorDictBase, minibatch: int) -> Callable[[
     gamma, lmbda = float(config.advantage.gamma), float(config.advantage.lmbda)
     clip, critic_coeff = float(config.loss.clip_epsilon), float(config.loss.critic_coeff)
     parameters = [*actor.parameters(), *critic.parameters()]
-    optimizer = torch.optim.Adam(parameters, lr=2e-3, eps=1e-5, fused=True)
+    optimizer = torch.optim.Adam(parameters, lr=lr, eps=1e-5, fused=True)
 
     def inputs(frames: TensorDictBase) -> Tensor:
         return torch.cat([frames.get(key) for key in actor.in_keys], -1)

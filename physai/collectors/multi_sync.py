@@ -5,6 +5,7 @@ import os
 import signal
 import sys
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import partial
 from typing import Any
 
@@ -72,8 +73,25 @@ class RobotMultiCollector(MultiSyncCollector):
     ) -> None:
         policy.share_memory()
         normalizer.share_memory()
+        threads, method = torch.get_num_threads(), multiprocessing.get_start_method(allow_none=True)
         # Forked workers start at once; fresh ones would import for seconds.
         multiprocessing.set_start_method("fork", force=True)
+        try:
+            with self._one_line():
+                self._start(workers, make_env, policy, normalizer, frames_per_batch, total_frames)
+        finally:
+            multiprocessing.set_start_method(method, force=True)
+            torch.set_num_threads(threads)  # those are the learner's: TorchRL takes one away for each worker
+
+    def _start(
+        self,
+        workers: int,
+        make_env: MakeEnv,
+        policy: TensorDictModuleBase,
+        normalizer: Normalizer,
+        frames_per_batch: int,
+        total_frames: int,
+    ) -> None:
         super().__init__(
             [partial(_start_worker, os.getpid(), make_env, normalizer, worker) for worker in range(workers)],
             policy_factory=partial(_same, policy),
@@ -91,24 +109,44 @@ class RobotMultiCollector(MultiSyncCollector):
         Raises:
             UserError: If a worker has died.
         """
+        batches = super().iterator()
+        while True:
+            with self._one_line():
+                batch = next(batches, None)
+            if batch is None:
+                return
+            yield batch
+
+    @contextmanager
+    def _one_line(self) -> Iterator[None]:
+        """Context in which whatever TorchRL says of a process that is gone becomes one line; the others end, too."""
         try:
-            yield from super().iterator()
-        except RuntimeError as error:
-            raise UserError(f"a process that collects has ended: {str(error).splitlines()[0]}") from error
+            yield
+        except UserError as error:  # a worker's own, with its traceback behind it
+            raise UserError(str(error).partition("\n")[0]) from error
+        except (RuntimeError, ValueError, OSError, EOFError) as error:
+            open_ones = [process for process in getattr(self, "procs", []) if not process._closed]
+            codes = [str(process.exitcode) for process in open_ones if process.exitcode is not None]
+            for process in open_ones:
+                process.kill()
+            reason = f"exit code {', '.join(codes)}" if codes else str(error).splitlines()[0]
+            raise UserError(f"a process that collects has ended ({reason})") from error
 
     def state(self) -> dict[str, Any]:
         """Return the state of all workers."""
-        return dict(self.state_dict())
+        with self._one_line():
+            return dict(self.state_dict())
 
     def set_state(self, state: dict[str, Any]) -> None:
         """Restore what ``state`` returned, in a collector made from the same config."""
-        self.load_state_dict(state)
+        with self._one_line():
+            self.load_state_dict(state)
 
 
 def _start_worker(learner: int, make_env: MakeEnv, normalizer: Normalizer, worker: int) -> TransformedRobotEnv:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes; the learner says what comes of it
-    for number in (signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT):
-        signal.signal(number, signal.SIG_DFL)
+    # These reach all processes of a terminal or a container; the learner says what comes of it.
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT):
+        signal.signal(number, signal.SIG_IGN)
     if sys.platform == "linux":  # pipes do not tell that the learner was killed: each worker holds both ends of others'
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
         if os.getppid() != learner:

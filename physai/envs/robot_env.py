@@ -62,7 +62,7 @@ class RobotEnv(EnvBase):
         return TensorDict({**self._observe(), **done}, batch_size=self.batch_size)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
-        reward, terminated, truncated = self.simulation.step(tensordict.get("action").numpy())
+        reward, terminated, truncated = self.simulation.step(tensordict.get("action").detach().numpy())
         results = {"reward": reward, "done": terminated | truncated, "terminated": terminated, "truncated": truncated}
         after = {key: torch.from_numpy(value) for key, value in results.items()}
         return TensorDict({**self._observe(), **after}, batch_size=self.batch_size)

@@ -149,7 +149,7 @@ class Simulation:
         return reward, terminated, truncated
 
     def step_one(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """Step the only robot: the same as ``step`` and ``observe``, in plain numbers.
+        """Step the only robot: ``step`` and ``observe`` in plain numbers, of double precision.
 
         Of one robot, NumPy's calls cost more than what they compute, too.
 

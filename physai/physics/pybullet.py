@@ -124,6 +124,9 @@ class PyBulletPhysics:
 
     def step(self, velocity_command: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """See :meth:`physai.physics.Physics.step`."""
+        expected = self.num_robots, len(self._joints)
+        if velocity_command.shape != expected:
+            raise ValueError(f"commands of shape {expected} are needed, got {velocity_command.shape}")
         # One flat pass over all joints of all robots: this loop is what collection costs most.
         commands = zip(self._motors, velocity_command.ravel().tolist(), self._velocity, strict=True)
         command, step, read = bullet.setJointMotorControl2, bullet.stepSimulation, bullet.getJointStates

@@ -82,6 +82,7 @@ class Agent:
     def close(self) -> None:
         """Free the robots."""
         self.collector.shutdown()
+        self.env.simulation.close()  # TorchRL's collector believes its env closed from the start
 
 
 def make_actor(config: TrainConfig, env: TransformedRobotEnv) -> TensorDictModuleBase:

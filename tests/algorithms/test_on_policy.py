@@ -161,6 +161,16 @@ def test_a_loss_that_is_not_finite_stops_before_the_step_and_hands_over_the_batc
     assert all(torch.equal(old, new) for old, new in zip(before, actor.parameters(), strict=True))
 
 
+def test_an_epoch_hands_out_every_sample_once_in_another_order_and_leaves_out_the_rest():
+    actor, critic, _ = small_batch()
+    algorithm = build(actor, critic, 10, "algo.minibatch_size=4")
+    algorithm.buffer.extend(TensorDict({"number": torch.arange(10)}, [10]))
+    epochs = [[minibatch["number"].tolist() for minibatch in algorithm._minibatches()] for _ in range(5)]
+    assert all([len(minibatch) for minibatch in epoch] == [4, 4] for epoch in epochs)
+    assert all(len({number for minibatch in epoch for number in minibatch}) == 8 for epoch in epochs)
+    assert len({str(epoch) for epoch in epochs}) == 5
+
+
 def test_state_continues_bit_for_bit():
     actor, critic, batch = small_batch()
     algorithm = build(actor, critic, 32, "algo.minibatch_size=8")

@@ -2,11 +2,13 @@
 
 import pytest
 import torch
+from hydra.utils import instantiate
 from tensordict import TensorDict
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.objectives import ClipPPOLoss
 
 from physai.algorithms import FusedClipPPOLoss
+from physai.config import compose
 from physai.policies import Critic, GaussianActor
 
 SETTINGS = {"clip_epsilon": 0.1, "entropy_coeff": 0.03, "critic_coeff": 0.7}
@@ -46,6 +48,19 @@ def test_losses_and_gradients_are_those_of_torchrl_s_loss(parts, normalize):
     for our, their in zip(our_gradients, their_gradients, strict=True):
         assert our.abs().max() > 0
         torch.testing.assert_close(our, their, rtol=1e-4, atol=1e-7)
+
+
+def test_torchrl_s_loss_can_be_put_in_its_place_by_config(parts):
+    actor, critic, frames = parts
+    swap = ["algo.loss._target_=torchrl.objectives.ClipPPOLoss", "+algo.loss.loss_critic_type=l2"]
+    results = []
+    for overrides in ([], swap):
+        node = compose("train", ["collector.frames_per_batch=64", "algo.minibatch_size=64", *overrides])
+        algorithm = instantiate(node.algo, actor=actor, critic=critic, frames_per_batch=64, _convert_="all")
+        results.append(algorithm.loss(frames))
+    assert type(algorithm.loss) is ClipPPOLoss
+    for key in ("loss_objective", "loss_critic", "loss_entropy"):
+        torch.testing.assert_close(results[0][key], results[1][key], rtol=1e-5, atol=1e-6)
 
 
 def test_what_the_loss_reads_is_left_as_it_is(parts):

@@ -70,6 +70,21 @@ def test_all_processes_see_the_learner_s_weights_and_normalization_from_the_next
                 parameter.add_(0.1)
 
 
+def test_the_learner_s_process_stays_as_it_was(collect):
+    before = torch.get_num_threads(), torch.multiprocessing.get_start_method(allow_none=True)
+    collect()
+    assert (torch.get_num_threads(), torch.multiprocessing.get_start_method(allow_none=True)) == before
+
+
+def test_a_worker_that_is_gone_when_it_is_asked_for_its_state_is_an_error_of_one_line(collect):
+    source, *_ = collect()
+    next(iter(source))
+    os.kill(source.procs[0].pid, signal.SIGKILL)
+    source.procs[0].join()
+    with pytest.raises(UserError, match="a process that collects has ended"):
+        source.state()
+
+
 def test_the_same_seed_gives_the_same_frames(collect):
     (first, *_), (again, *_), (other, *_) = collect(seed=1), collect(seed=1), collect(seed=2)
     for ours, theirs, _ in zip(first, again, range(2), strict=False):
@@ -96,7 +111,7 @@ def test_a_killed_worker_ends_collection_with_an_error_and_takes_the_others_alon
     next(batches)
     os.kill(source.procs[1].pid, signal.SIGKILL)
     started = time.monotonic()
-    with pytest.raises(UserError, match="worker 1"):
+    with pytest.raises(UserError, match="exit code -9"):
         list(batches)
     source.shutdown()
     assert time.monotonic() - started < 20

@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
 from torchrl.envs import check_env_specs
 
 import physai
@@ -51,6 +52,12 @@ def parametrized(test):
     for mark in every_env:
         test = mark(test)
     return test
+
+
+def test_a_policy_that_is_being_learnt_can_drive_a_rollout(make_env):
+    policy = TensorDictModule(torch.nn.Linear(8, 2), in_keys=["observation"], out_keys=["action"])
+    rollout = make_env().rollout(3, policy, break_when_any_done=False)
+    assert rollout["action"].requires_grad
 
 
 @parametrized

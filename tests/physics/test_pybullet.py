@@ -394,3 +394,11 @@ def test_a_thousand_robots_work_in_one_process(planar):
         alone.close()
     finally:
         physics.close()
+
+
+@pytest.mark.parametrize("shape", [(3, 2), (4, 3), (8, 1), (2,)])
+def test_commands_of_another_shape_are_refused(reacher, shape):
+    physics = PyBulletPhysics(RobotSpec.from_config(reacher.robot), 4, 0.02)
+    with pytest.raises(ValueError, match="shape"):
+        physics.step(np.zeros(shape))
+    physics.close()

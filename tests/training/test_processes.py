@@ -71,7 +71,8 @@ def test_a_killed_run_leaves_no_worker_and_goes_on_bit_for_bit(finished, tmp_pat
     assert summary["weights_sha256"] in (tmp_path / "run" / "summary.json").read_text()
 
 
-def test_ctrl_c_which_reaches_all_processes_saves_and_the_run_goes_on(finished, tmp_path):
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_signal_that_reaches_all_processes_saves_and_the_run_goes_on(finished, tmp_path, number, code):
     process = subprocess.Popen(
         [sys.executable, "-m", "physai.train", *OVERRIDES, "checkpoint.every_frames=1000000", "hydra.run.dir=run"],
         cwd=tmp_path,
@@ -83,9 +84,9 @@ def test_ctrl_c_which_reaches_all_processes_saves_and_the_run_goes_on(finished, 
     deadline = time.monotonic() + 60
     while not (tmp_path / "run" / "metrics.csv").is_file() and time.monotonic() < deadline:
         time.sleep(0.005)
-    os.killpg(process.pid, signal.SIGINT)
+    os.killpg(process.pid, number)
     output = process.communicate()[0]
-    assert process.returncode == 130, output
+    assert process.returncode == code, output
     assert "python -m physai.train resume=run" in output
     resume(tmp_path)
     assert finished[1]["weights_sha256"] in (tmp_path / "run" / "summary.json").read_text()
@@ -97,7 +98,7 @@ def test_a_killed_worker_ends_the_run_in_one_line_and_it_can_be_resumed(finished
     output = process.communicate(timeout=60)[0]
     assert process.returncode == 2
     assert "Traceback" not in output
-    assert "error: a process that collects has ended" in output
+    assert "error: a process that collects has ended (exit code -9)" in output
     assert all_gone(workers)
     resume(tmp_path)
     assert finished[1]["weights_sha256"] in (tmp_path / "run" / "summary.json").read_text()

@@ -1,0 +1,21 @@
+"""The measurement of collection runs, and shows every figure."""
+
+import pytest
+from rich.console import Console
+
+from physai.bench import collection
+
+
+@pytest.mark.slow
+def test_the_bare_loop_one_process_and_two_are_timed_and_shown(monkeypatch):
+    monkeypatch.setattr(collection, "ROBOTS", (2, 64))
+    monkeypatch.setattr(collection, "ROUNDS", 1)
+    monkeypatch.setattr(collection, "STEPS_PER_ROUND", 8)
+    default, speeds = collection.measure_collection(seed=0)
+    assert set(speeds) == {2, 64, default}
+    assert all(len(sides) == 3 and min(sides) > 0 for sides in speeds.values())
+    console = Console(width=120, record=True)
+    console.print(collection.collection_table(default, speeds))
+    shown = console.export_text()
+    for part in ("bare PyBullet", "one process", "two processes", f"{default} (default)"):
+        assert part in shown
