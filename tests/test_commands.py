@@ -51,7 +51,7 @@ BAD_TRAINING = {
     ),
     "misspelt argument with +": (
         ["+algo.loss.clip_epsilonn=1"],
-        "clip_epsilonn' of torchrl.objectives.ClipPPOLoss; did you mean",
+        "clip_epsilonn' of physai.algorithms.FusedClipPPOLoss; did you mean",
     ),
     "key at the wrong place": (["+clip_epsilon=0.1"], "did you mean 'algo.loss.clip_epsilon'?"),
     "misspelt group": (["envs=reacher"], "unknown key 'envs'; did you mean 'env'?"),
