@@ -1,10 +1,10 @@
 """What a run costs as it grows: time and memory against frames, and against robots."""
 
 import json
-import os
 import subprocess
 import sys
 import tempfile
+import time
 from argparse import Namespace
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,9 +14,9 @@ from rich.table import Table
 from physai.bench.timing import reacher, table
 from physai.errors import UserError
 
-FRAMES = (131_072, 262_144, 524_288, 1_048_576, 2_097_152)
+FRAMES = (131_072, 262_144, 524_288, 1_048_576)
 ROBOTS = (64, 128, 256, 512, 1024)
-ROBOTS_FRAMES = 262_144
+ROBOTS_FRAMES = 131_072
 
 
 @dataclass(frozen=True)
@@ -51,15 +51,28 @@ def _run(frames: int, robots: int, seed: int) -> Run:
             *(f"total_frames={frames}", f"collector.num_envs={robots}"),
             "evaluation.episodes=100",  # the thousand robots of the final evaluation would hide the others
         ]
-        process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
-        said = process.stdout.read() if process.stdout else ""
-        _, status, usage = os.wait4(process.pid, 0)
-        if os.waitstatus_to_exitcode(status):
-            raise UserError(f"training failed: {said[-1000:]}")
+        megabytes = 0.0
+        with open(Path(folder) / "said.txt", "w+") as said:
+            process = subprocess.Popen(command, stdout=said, stderr=subprocess.STDOUT)
+            while process.poll() is None:
+                megabytes = max(megabytes, _peak_memory(process.pid))
+                time.sleep(0.05)
+            if process.returncode:
+                said.seek(0)
+                raise UserError(f"training failed: {said.read()[-1000:]}")
         summary = json.loads((Path(folder) / "summary.json").read_text())
-    run = Run(summary["frames"], robots, summary["train_seconds"], usage.ru_maxrss / 1024)
+    run = Run(summary["frames"], robots, summary["train_seconds"], megabytes)
     print(f"{run.frames:>9,} frames, {robots:>5,} robots: {run.seconds:6.1f} s, {run.megabytes:,.0f} MB", flush=True)
     return run
+
+
+def _peak_memory(pid: int) -> float:
+    """Most memory that a running process has had, MB."""  # wait4's counts the parent's, which it had at its fork
+    try:
+        lines = Path(f"/proc/{pid}/status").read_text().splitlines()
+    except FileNotFoundError:  # it has just ended
+        return 0.0
+    return next((float(line.split()[1]) / 1024 for line in lines if line.startswith("VmHWM")), 0.0)
 
 
 def growth_table(by_frames: list[Run], by_robots: list[Run]) -> Table:
