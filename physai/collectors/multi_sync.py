@@ -78,30 +78,19 @@ class RobotMultiCollector(MultiSyncCollector):
         multiprocessing.set_start_method("fork", force=True)
         try:
             with self._one_line():
-                self._start(workers, make_env, policy, normalizer, frames_per_batch, total_frames)
+                super().__init__(
+                    [partial(_start_worker, os.getpid(), make_env, normalizer, worker) for worker in range(workers)],
+                    policy_factory=partial(_same, policy),
+                    collector_class=WorkerCollector,
+                    frames_per_batch=frames_per_batch,
+                    total_frames=total_frames,
+                    cat_results=0,
+                    use_buffers=True,
+                    auto_register_policy_transforms=False,
+                )
         finally:
             multiprocessing.set_start_method(method, force=True)
             torch.set_num_threads(threads)  # those are the learner's: TorchRL takes one away for each worker
-
-    def _start(
-        self,
-        workers: int,
-        make_env: MakeEnv,
-        policy: TensorDictModuleBase,
-        normalizer: Normalizer,
-        frames_per_batch: int,
-        total_frames: int,
-    ) -> None:
-        super().__init__(
-            [partial(_start_worker, os.getpid(), make_env, normalizer, worker) for worker in range(workers)],
-            policy_factory=partial(_same, policy),
-            collector_class=WorkerCollector,
-            frames_per_batch=frames_per_batch,
-            total_frames=total_frames,
-            cat_results=0,
-            use_buffers=True,
-            auto_register_policy_transforms=False,
-        )
 
     def iterator(self) -> Iterator[TensorDictBase]:
         """Collect batches.
@@ -129,7 +118,7 @@ class RobotMultiCollector(MultiSyncCollector):
             codes = [str(process.exitcode) for process in open_ones if process.exitcode is not None]
             for process in open_ones:
                 process.kill()
-            reason = f"exit code {', '.join(codes)}" if codes else str(error).splitlines()[0]
+            reason = f"exit code {', '.join(codes)}" if codes else (str(error) or type(error).__name__).splitlines()[0]
             raise UserError(f"a process that collects has ended ({reason})") from error
 
     def state(self) -> dict[str, Any]:
