@@ -9,20 +9,36 @@ from physai.errors import UserError
 from physai.training.agent import Agent
 from physai.training.config import TrainConfig
 
-SMALL = ("collector.num_envs=4", "collector.frames_per_batch=64", "algo.minibatch_size=32")
+SMALL = ("collector.num_envs=4", "collector.frames_per_batch=64")
 
 
 def choices(group: str) -> list[str]:
     return sorted(path.stem for path in (Path(conf_dir()) / group).glob("*.yaml"))
 
 
+def algorithm_of(policy: str) -> str:
+    """The first algorithm that brings these networks along; PPO takes the others."""
+    for name in choices("algo"):
+        if compose("train", [f"algo={name}"], hydra=True).hydra.runtime.choices.policy == policy:
+            return f"algo={name}"
+    return "algo=ppo"
+
+
+def small(*overrides: str) -> TrainConfig:
+    """A config of few robots and small batches."""
+    minibatch = ["algo.minibatch_size=32"] if "minibatch_size" in compose("train", overrides).algo else []
+    return validate(TrainConfig, compose("train", [*overrides, *SMALL, *minibatch]))
+
+
 @pytest.mark.parametrize(
-    "override",
-    [f"{group}={name}" for group in ("env", "algo", "policy", "randomization", "logger") for name in choices(group)]
-    + [f"experiment={name}" for name in choices("experiment")],
+    "overrides",
+    [[f"{group}={name}"] for group in ("env", "algo", "randomization", "logger") for name in choices(group)]
+    + [[algorithm_of(name), f"policy={name}"] for name in choices("policy")]
+    + [[f"experiment={name}"] for name in choices("experiment")],
+    ids=lambda overrides: overrides[-1],
 )
-def test_every_choice_builds_and_collects(override):
-    config = validate(TrainConfig, compose("train", [override, *SMALL]))
+def test_every_choice_builds_and_collects(overrides):
+    config = small(*overrides)
     if not config.env.simulated:
         with pytest.raises(UserError, match="a policy is trained on simulated robots"):
             Agent.build(config)

@@ -1,6 +1,8 @@
 """Learning from collected frames."""
 
-from physai.algorithms.on_policy import NonFiniteError, OnPolicy
+from physai.algorithms.interface import Algorithm, Networks, NonFiniteError
+from physai.algorithms.off_policy import OffPolicy
+from physai.algorithms.on_policy import OnPolicy
 from physai.algorithms.ppo_loss import FusedClipPPOLoss
 
-__all__ = ["FusedClipPPOLoss", "NonFiniteError", "OnPolicy"]
+__all__ = ["Algorithm", "FusedClipPPOLoss", "Networks", "NonFiniteError", "OffPolicy", "OnPolicy"]

@@ -11,15 +11,27 @@ from torch import Tensor
 
 import physai
 from physai.artifact.states import States
-from physai.deploy.metadata import DISTANCE, FORMAT, FORMAT_VERSION, INPUTS, OUTPUT, UNITS
+from physai.deploy.metadata import (
+    DISTANCE,
+    FORMAT,
+    FORMAT_VERSION,
+    MEMORY,
+    NEW_MEMORY,
+    OUTPUT,
+    UNITS,
+    inputs,
+    outputs,
+)
 from physai.envs.simulation import Simulation
 
 
-def describe_robot(simulation: Simulation) -> dict[str, Any]:
-    """Robot, joints, limits, rate and goals: what a controller must know."""
+def describe_robot(simulation: Simulation, memory_size: int = 0) -> dict[str, Any]:
+    """Robot, joints, limits, rate and goals, and how much the policy remembers: what a controller must know."""
     spec, config = simulation.spec, simulation.config
     joints, goal = len(spec.joints), simulation.task.goal_size
     inner, outer = simulation.task.goal_region
+    sizes = {"joint_position": joints, "joint_velocity": joints, "goal": goal, OUTPUT: joints}
+    sizes |= {MEMORY: memory_size, NEW_MEMORY: memory_size}
     return {
         "robot": {
             "name": spec.name,
@@ -28,8 +40,8 @@ def describe_robot(simulation: Simulation) -> dict[str, Any]:
             "urdf_sha256": hashlib.sha256(spec.urdf.read_bytes()).hexdigest(),
         },
         "units": UNITS,
-        "inputs": {"joint_position": ["N", joints], "joint_velocity": ["N", joints], "goal": ["N", goal]},
-        "outputs": {OUTPUT: ["N", joints]},
+        "inputs": {key: ["N", sizes[key]] for key in inputs(memory_size)},
+        "outputs": {key: ["N", sizes[key]] for key in outputs(memory_size)},
         "limits": {
             "position": [[x if np.isfinite(x) else None for x in pair] for pair in spec.position_limit.tolist()],
             "velocity": spec.velocity_limit.tolist(),
@@ -53,11 +65,8 @@ def describe_origin(git_commit: str | None) -> dict[str, Any]:
     }
 
 
-def golden_pairs(states: States, answers: Tensor, pairs: int) -> dict[str, Any]:
-    """Pick pairs for the loader to try, evenly from S states and the answers [S, n + 1] to them.
-
-    An answer is a command and a distance, asked for at batch 1.
-    """
-    rows = torch.linspace(0, len(answers) - 1, pairs).long()
-    columns = dict(zip(INPUTS, states, strict=True)) | {OUTPUT: answers[:, :-1], DISTANCE: answers[:, -1:]}
+def golden_pairs(states: States, answers: dict[str, Tensor], pairs: int) -> dict[str, Any]:
+    """Pick pairs for the loader to try, evenly from S states and the answers to them, asked for at batch 1."""
+    rows = torch.linspace(0, len(states.goal) - 1, pairs).long()
+    columns = states.named() | answers
     return {key: value[rows].tolist() for key, value in columns.items()}  # doubles hold float32 exactly

@@ -5,7 +5,7 @@ import warnings
 
 
 def main(policy: str, inputs: str, outputs: str) -> None:
-    """Write the commands and distances of ``policy`` for each row of ``inputs`` (.npz) to ``outputs`` (.npy)."""
+    """Write what ``policy`` gives for each row of ``inputs`` (.npz), and distances, to ``outputs`` (.npy)."""
     for name in ("physai", "tensordict", "torchrl"):
         sys.modules[name] = None  # type: ignore[assignment]  # importing them fails from here on
     import numpy as np
@@ -15,11 +15,13 @@ def main(policy: str, inputs: str, outputs: str) -> None:
     torch.set_num_threads(1)
     module = torch.jit.load(policy)
     given = np.load(inputs)
-    columns = [torch.from_numpy(given[key]) for key in ("joint_position", "joint_velocity", "goal")]
+    columns = [torch.from_numpy(given[key]) for key in given.files]  # joint_position, joint_velocity, goal, memory
     rows = []
     for index in range(len(columns[0])):
-        position, velocity, goal = (column[index : index + 1] for column in columns)
-        rows.append(torch.cat([module(position, velocity, goal), module.distance(position, goal)], dim=1))
+        row = [column[index : index + 1] for column in columns]
+        answer = module(*row)
+        answers = answer if isinstance(answer, tuple) else (answer,)
+        rows.append(torch.cat([*answers, module.distance(row[0], row[2])], dim=1))
     np.save(outputs, torch.cat(rows).numpy())
 
 

@@ -15,9 +15,9 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from physai.artifact import fresh_process
-from physai.artifact.module import VIEWS, DeployablePolicy
+from physai.artifact.module import VIEWS, DeployablePolicy, as_tuple
 from physai.artifact.states import States
-from physai.deploy.metadata import DISTANCE, INPUTS, OUTPUT, Metadata
+from physai.deploy.metadata import DISTANCE, NEW_MEMORY, OUTPUT, Metadata, inputs
 from physai.deploy.policy import load_module
 from physai.envs.make import TransformedRobotEnv
 from physai.envs.simulation import Simulation
@@ -30,7 +30,8 @@ ONNX_TOLERANCE = 1e-5  # rad/s
 SUCCESS_TOLERANCE = 0.01
 PATIENCE = 120  # s
 
-Function = Callable[[Tensor, Tensor, Tensor], Tensor]
+Function = Callable[..., Tensor | tuple[Tensor, ...]]
+"""A policy: its inputs, [N, ...] each, to a command [N, n], or to a command and a new memory [N, H]."""
 
 
 class GateError(UserError):
@@ -65,23 +66,35 @@ def compare(stage: str, what: str, found: Tensor, expected: Tensor, states: Stat
 
 
 def one_by_one(function: Function, states: States) -> Tensor:
-    """Call a function on one state after the other, as a robot does; stack what it returns."""
-    return torch.cat([function(*states.row(index)) for index in range(len(states.goal))])
+    """Call a function on one state after the other, as a robot does; stack what it returns, side by side."""
+    return torch.cat([torch.cat(as_tuple(function(*row)), dim=1) for row in states.rows()])
 
 
 def answers(policy: Any, states: States) -> Tensor:
-    """What a policy, eager or scripted, gives for S states, one by one: [S, n + 1], commands and distances."""
-    return one_by_one(lambda q, qd, goal: torch.cat([policy(q, qd, goal), policy.distance(q, goal)], dim=1), states)
+    """What a policy, eager or scripted, gives for S states, one by one.
+
+    Returns:
+        [S, n + 1], commands and distances; of a policy that remembers [S, n + H + 1], new memories in between.
+    """
+    return one_by_one(lambda *row: (*as_tuple(policy(*row)), policy.distance(row[0], row[2])), states)
+
+
+def split(answers: Tensor, states: States) -> dict[str, Tensor]:
+    """Take ``answers`` to S states apart, by name."""
+    joints = states.joint_position.shape[1]
+    parts = {OUTPUT: answers[:, :joints], NEW_MEMORY: answers[:, joints:-1], DISTANCE: answers[:, -1:]}
+    return {key: part for key, part in parts.items() if part.shape[1]}
 
 
 def compare_answers(stage: str, found: Tensor, expected: Tensor, states: States) -> None:
-    """Compare answers [S, n + 1] to the last bit.
+    """Compare answers to the last bit.
 
     Raises:
-        GateError: If a command or a distance differs.
+        GateError: If a command, a memory or a distance differs.
     """
-    compare(stage, OUTPUT, found[:, :-1], expected[:, :-1], states)
-    compare(stage, DISTANCE, found[:, -1:], expected[:, -1:], states)
+    given = split(found, states)
+    for key, part in split(expected, states).items():
+        compare(stage, key, given.get(key, found[:, :0]), part, states)
 
 
 @torch.no_grad()
@@ -108,29 +121,86 @@ def check_against_env(
         GateError: If anything differs.
     """
     stage = "the artifact is not the policy in its environment"
-    met = States(*(rollout.get(key) for key in INPUTS))
-    for key, view in zip(VIEWS, policy.views(*met), strict=True):
+    met = States(*(rollout.get(key) for key in policy.in_keys))
+    for key, view in zip(VIEWS, policy.views(*met.sensed), strict=True):
         scale = rollout.get(key).abs().max().clamp(min=1.0)
         compare(stage, key, view / scale, rollout.get(key) / scale, met, BATCH_TOLERANCE)
-    action = rollout.get("action").clamp(-1.0, 1.0)
-    limit = torch.tensor(env.simulation.config.max_velocity)
-    compare(stage, OUTPUT, policy(*met), action * limit, met, BATCH_TOLERANCE)
+    limit = env.simulation.config.max_velocity
+    acted = (rollout.get("action").clamp(-1.0, 1.0) * torch.tensor(limit), rollout.get(NEW_MEMORY, None))
+    for key, answer, expected in zip(policy.out_keys, as_tuple(policy(*met)), acted, strict=False):
+        compare(stage, key, answer, expected, met, BATCH_TOLERANCE)
 
-    transforms = [t for t in env.transform if isinstance(t, Observation | ObservationNormalization)]
-    for index in range(len(states.goal)):
-        row = states.row(index)
-        seen = TensorDict(dict(zip(INPUTS, row, strict=True)), batch_size=[1])
-        for transform in transforms:
-            seen = transform._step(seen, seen)
-        for key, view in zip(VIEWS, policy.views(*row), strict=True):
+    see, act = _seeing(env), acting(actor, env)
+    for row in states.rows():
+        seen = see(*row)
+        for key, view in zip(VIEWS, policy.views(*row.sensed), strict=True):
             compare(stage, key, view, seen.get(key), row)
-        compare(stage, OUTPUT, policy(*row), actor(seen).get("action").clamp(-1.0, 1.0) * limit, row)
+        for key, answer, expected in zip(policy.out_keys, as_tuple(policy(*row)), as_tuple(act(*row)), strict=True):
+            compare(stage, key, answer, expected, row)
         distance = env.simulation.observation.distance(row.joint_position, row.goal)
         compare(stage, DISTANCE, policy.distance(row.joint_position, row.goal), distance, row)
 
 
+def _seeing(env: TransformedRobotEnv) -> Callable[..., TensorDictBase]:
+    """What the env's own transforms make of a policy's inputs."""
+    transforms = [t for t in env.transform if isinstance(t, Observation | ObservationNormalization)]
+
+    def see(*inputs: Tensor) -> TensorDictBase:
+        seen: TensorDictBase = TensorDict(States(*inputs).named(), batch_size=[len(inputs[0])])
+        for transform in transforms:
+            seen = transform._step(seen, seen)
+        return seen
+
+    return see
+
+
+def acting(actor: TensorDictModuleBase, env: TransformedRobotEnv) -> Function:
+    """The trained policy itself, behind its env's transforms, as a function of what a robot senses."""
+    see, limit = _seeing(env), torch.tensor(env.simulation.config.max_velocity)
+
+    @torch.no_grad()
+    def act(*inputs: Tensor) -> tuple[Tensor, ...]:
+        with set_exploration_type(ExplorationType.DETERMINISTIC):
+            acted = actor(see(*inputs))
+        command = acted.get("action").clamp(-1.0, 1.0) * limit
+        return (command, acted.get(NEW_MEMORY)) if len(inputs) > len(States(*inputs).sensed) else (command,)
+
+    return act
+
+
+def unroll(function: Function, states: States) -> Tensor:
+    """Let a policy remember S states, one after the other, from a memory of zeros on.
+
+    Returns:
+        [S, n + H], commands and memories.
+    """
+    memory, steps = torch.zeros_like(states.memory[:1]), []
+    for row in states.sensed.rows():
+        command, memory = function(*row, memory)
+        steps.append(torch.cat([command, memory], dim=1))
+    return torch.cat(steps)
+
+
+def check_recurrence(forms: dict[str, tuple[Function, float]], actor: Function, states: States) -> None:
+    """Forms of a policy that remembers, each with its own memory, over S steps.
+
+    Args:
+        forms: By name, with the largest difference allowed.
+        actor: From ``acting``.
+        states: What there is to remember.
+
+    Raises:
+        GateError: If a command or a memory differs.
+    """
+    expected, joints = unroll(actor, states), states.joint_position.shape[1]
+    for name, (form, tolerance) in forms.items():
+        found, stage = unroll(form, states), f"{name} remembers otherwise"
+        compare(stage, OUTPUT, found[:, :joints], expected[:, :joints], states, tolerance)
+        compare(stage, NEW_MEMORY, found[:, joints:], expected[:, joints:], states, tolerance)
+
+
 def ask_fresh_process(content: bytes, states: States) -> Tensor:
-    """Answers [S, n + 1] of a TorchScript file in a fresh process that cannot import physai, tensordict or torchrl.
+    """Answers of a TorchScript file in a fresh process that cannot import physai, tensordict or torchrl.
 
     Raises:
         GateError: If the file does not run there.
@@ -138,8 +208,7 @@ def ask_fresh_process(content: bytes, states: States) -> Tensor:
     with tempfile.TemporaryDirectory() as folder:
         policy, inputs, outputs = (Path(folder) / name for name in ("policy.pt", "inputs.npz", "outputs.npy"))
         policy.write_bytes(content)
-        position, velocity, goal = (value.numpy() for value in states)
-        np.savez(inputs, joint_position=position, joint_velocity=velocity, goal=goal)
+        np.savez(inputs, **{key: value.numpy() for key, value in states.named().items()})
         command = [sys.executable, "-I", fresh_process.__file__, str(policy), str(inputs), str(outputs)]
         try:
             process = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE)
@@ -157,23 +226,25 @@ def check_metadata(metadata: Metadata, simulation: Simulation, expected: Tensor)
     Args:
         metadata: Of the loaded file.
         simulation: Robot and task.
-        expected: Answers [S, n + 1]; no command may be beyond the limit that the file names.
+        expected: Answers to S states; no command may be beyond the limit that the file names.
 
     Raises:
         GateError: If a part differs; it says which.
     """
     spec, config, task = simulation.spec, simulation.config, simulation.task
+    joints = len(spec.joints)
     true = {
         "robot": spec.name,
         "joints": spec.joints,
         "position_limit": spec.position_limit,
         "velocity_limit": spec.velocity_limit,
         "effort_limit": spec.effort_limit,
-        "command_limit": np.full(len(spec.joints), config.max_velocity),
+        "command_limit": np.full(joints, config.max_velocity),
         "control_rate": 1.0 / config.control_dt,
         "goal_frame": spec.base,
         "goal_radius": task.goal_region,
         "goal_tolerance": task.tolerance,
+        "memory_size": expected.shape[1] - joints - 1,
     }
     for key, value in true.items():
         said = getattr(metadata, key)
@@ -182,22 +253,28 @@ def check_metadata(metadata: Metadata, simulation: Simulation, expected: Tensor)
     urdf = hashlib.sha256(spec.urdf.read_bytes()).hexdigest()
     if metadata.raw["robot"]["urdf_sha256"] != urdf:
         raise GateError("the metadata is wrong: urdf_sha256 is not that of the robot's URDF")
-    largest = expected[:, :-1].abs().amax(dim=0).numpy()
+    largest = expected[:, :joints].abs().amax(dim=0).numpy()
     if (largest > metadata.command_limit * (1 + 1e-6)).any():
         raise GateError(f"the policy commands {largest.tolist()} rad/s, beyond its limit {metadata.command_limit}")
 
 
 def check_onnx(runtime: Function, expected: Tensor, states: States) -> float:
-    """Return the largest difference of the commands in ONNX Runtime to answers [S, n + 1], in rad/s.
+    """Return the largest difference of the outputs in ONNX Runtime to answers, in rad/s.
 
     Raises:
         GateError: If it is larger than ``ONNX_TOLERANCE``.
     """
-    stage, commands = "ONNX Runtime disagrees", expected[:, :-1]
-    return max(
-        compare(f"{stage} (one by one)", OUTPUT, one_by_one(runtime, states), commands, states, ONNX_TOLERANCE),
-        compare(f"{stage} (in a batch)", OUTPUT, runtime(*states), commands, states, ONNX_TOLERANCE),
-    )
+    worst, joints = 0.0, states.joint_position.shape[1]
+    for how, found in (
+        ("one by one", one_by_one(runtime, states)),
+        ("in a batch", torch.cat(as_tuple(runtime(*states)), dim=1)),
+    ):
+        for key, part in ((OUTPUT, slice(0, joints)), (NEW_MEMORY, slice(joints, -1))):
+            if expected[:, part].shape[1]:
+                given = found[:, part.start : None if part.stop == -1 else part.stop]
+                stage = f"ONNX Runtime disagrees ({how})"
+                worst = max(worst, compare(stage, key, given, expected[:, part], states, ONNX_TOLERANCE))
+    return worst
 
 
 def check_drive(

@@ -11,7 +11,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
 from physai.deploy.archive import METADATA
-from physai.deploy.metadata import INPUTS, OUTPUT
+from physai.deploy.metadata import INPUTS, OUTPUT, inputs, outputs
 from physai.envs.make import TransformedRobotEnv
 from physai.errors import UserError
 
@@ -35,6 +35,7 @@ class DeployablePolicy(TensorDictModuleBase):
     """
 
     __jit_unused_properties__ = ("in_keys", "out_keys", "out_keys_source")  # of the base class; they do not script
+    memory_size = 0
 
     def __init__(
         self,
@@ -72,7 +73,8 @@ class DeployablePolicy(TensorDictModuleBase):
         if len(inputs) != 1:
             return super().__call__(*inputs)
         (tensordict,) = inputs
-        return tensordict.set(OUTPUT, super().__call__(*(tensordict.get(key) for key in self.in_keys)))
+        answer = super().__call__(*(tensordict.get(key) for key in self.in_keys))
+        return tensordict.update(dict(zip(self.out_keys, as_tuple(answer), strict=True)))
 
     def views(self, joint_position: Tensor, joint_velocity: Tensor, goal: Tensor) -> list[Tensor]:
         """What the policy can see, in the order of ``VIEWS``: [N, 2n + 4], the same, and [N, features]."""
@@ -86,6 +88,48 @@ class DeployablePolicy(TensorDictModuleBase):
         return distance
 
 
+class RecurrentDeployablePolicy(DeployablePolicy):
+    """A policy that remembers; its memory is an input and an output, and zeros where an episode begins.
+
+    Args:
+        observation: The task's observation module.
+        normalizer: Normalizes an observation.
+        network: Maps what it sees, side by side, and a memory to actions in [-1, 1] and the new memory.
+        in_keys: What the network sees, of ``VIEWS``, in order.
+        command_limit: What an action of 1 means, rad/s, [n].
+        memory_size: H.
+
+    Raises:
+        UserError: If the policy sees what no robot can tell it.
+    """
+
+    def __init__(
+        self,
+        observation: nn.Module,
+        normalizer: nn.Module,
+        network: nn.Module,
+        in_keys: list[str],
+        command_limit: Tensor,
+        memory_size: int,
+    ) -> None:
+        super().__init__(observation, normalizer, network, in_keys, command_limit)
+        self.memory_size = memory_size
+        self.in_keys, self.out_keys = list(inputs(memory_size)), list(outputs(memory_size))
+
+    def forward(  # type: ignore[override]  # TorchScript knows no optional outputs
+        self, joint_position: Tensor, joint_velocity: Tensor, goal: Tensor, memory: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Map what the robot senses, as without memory, and a memory [N, H] to commands [N, n] and the new memory."""
+        views = self.views(joint_position, joint_velocity, goal)
+        action, new_memory = self.network(torch.cat([views[i] for i in self.seen], dim=1), memory)
+        return action * self.command_limit, new_memory
+
+
+def as_tuple(answer: Tensor | tuple[Tensor, ...]) -> tuple[Tensor, ...]:
+    """What a policy gives: a command, or a command and a memory."""
+    return answer if isinstance(answer, tuple) else (answer,)
+
+
 def make_deployable(actor: TensorDictModuleBase, env: TransformedRobotEnv) -> DeployablePolicy:
     """Put a trained actor and the env that it was trained in together.
 
@@ -94,8 +138,11 @@ def make_deployable(actor: TensorDictModuleBase, env: TransformedRobotEnv) -> De
     """
     joints = len(env.simulation.spec.joints)
     limit = torch.full((joints,), env.simulation.config.max_velocity)
-    normalizer = env.normalization.normalizer
-    return DeployablePolicy(env.simulation.observation, normalizer, actor.deterministic(), actor.in_keys, limit)
+    views = env.simulation.observation, env.normalization.normalizer
+    size = getattr(actor, "memory_size", 0)
+    if size:
+        return RecurrentDeployablePolicy(*views, actor.deterministic(), actor.seen_keys, limit, size)
+    return DeployablePolicy(*views, actor.deterministic(), actor.in_keys, limit)
 
 
 def script(policy: DeployablePolicy) -> torch.jit.ScriptModule:

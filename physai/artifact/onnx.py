@@ -12,9 +12,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from physai.artifact.module import DeployablePolicy
 from physai.artifact.states import States
 from physai.deploy.archive import METADATA
-from physai.deploy.metadata import INPUTS, OUTPUT
 from physai.errors import UserError
 
 PACKAGES = ("onnx", "onnxscript", "onnxruntime")
@@ -25,7 +25,7 @@ def missing() -> list[str]:
     return [name for name in PACKAGES if importlib.util.find_spec(name) is None]
 
 
-def convert(policy: torch.nn.Module, states: States) -> bytes:
+def convert(policy: DeployablePolicy, states: States) -> bytes:
     """Convert a policy, for any number of rows.
 
     Args:
@@ -45,9 +45,9 @@ def convert(policy: torch.nn.Module, states: States) -> bytes:
                 policy,
                 tuple(value[:2].clone() for value in states),
                 dynamo=True,
-                dynamic_shapes=({0: rows},) * len(INPUTS),
-                input_names=list(INPUTS),
-                output_names=[OUTPUT],
+                dynamic_shapes=({0: rows},) * len(states),
+                input_names=list(policy.in_keys),
+                output_names=list(policy.out_keys),
                 verbose=False,
             )
         except Exception as error:  # its own hierarchy is private
@@ -104,11 +104,12 @@ class Runtime:
         except Exception as error:  # its classes are private
             raise UserError(f"ONNX Runtime refuses the file ({' '.join(str(error).split())[:160]})") from None
 
-    def __call__(self, joint_position: Tensor, joint_velocity: Tensor, goal: Tensor) -> Tensor:
-        """Map positions [N, n] rad, velocities [N, n] rad/s and goals [N, 2] m to velocity commands [N, n], rad/s."""
-        inputs = zip(INPUTS, (joint_position, joint_velocity, goal), strict=True)
-        (output,) = self._session.run([OUTPUT], {key: value.numpy() for key, value in inputs})
-        return torch.from_numpy(output)
+    def __call__(self, *inputs: Tensor) -> Tensor | tuple[Tensor, ...]:
+        """Map a policy's inputs to its outputs, as its module does: positions [N, n] rad, velocities [N, n] rad/s, ..."""
+        names = [node.name for node in self._session.get_inputs()]
+        given = {name: value.numpy() for name, value in zip(names, inputs, strict=True)}
+        outputs = tuple(map(torch.from_numpy, self._session.run(None, given)))
+        return outputs if len(outputs) > 1 else outputs[0]
 
 
 @contextlib.contextmanager

@@ -1,29 +1,44 @@
 """The one place where a config becomes a collector."""
 
+import inspect
 from collections.abc import Callable
+from typing import Any
 
 import torch
 from tensordict.nn import TensorDictModuleBase
 
-from physai.collectors.multi_sync import RobotMultiCollector
+from physai.collectors.interface import FrameSource
+from physai.collectors.multi_async import RobotMultiAsyncCollector
+from physai.collectors.multi_sync import RobotMultiSyncCollector
 from physai.collectors.single import RobotCollector
-from physai.config import Config, Count
+from physai.config import Config, Count, nearest
 from physai.envs.make import TransformedRobotEnv
 from physai.errors import UserError
 from physai.seeding import derive
 
 
 class CollectorConfig(Config):
-    """One file of ``conf/collector``; ``num_envs`` and ``frames_per_batch`` are those of all processes together."""
+    """One file of ``conf/collector``; ``num_envs`` and ``frames_per_batch`` are those of all processes together.
+
+    One process that others would wait for (``sync``) is the learner's own; others are forked from it, or, with
+    ``ray_init``, arguments of ``ray.init``, started by Ray.
+    """
 
     num_envs: Count
     frames_per_batch: Count
     processes: Count
+    sync: bool
+    ray_init: dict[str, Any] | None
+
+    @property
+    def here(self) -> bool:
+        """Whether the learner's process collects."""
+        return self.processes == 1 and self.sync and self.ray_init is None
 
     @property
     def robots_here(self) -> int:
         """How many robots the learner's own process needs: all, or one that shows what others are like."""
-        return self.num_envs if self.processes == 1 else 1
+        return self.num_envs if self.here else 1
 
 
 def make_collector(
@@ -33,38 +48,46 @@ def make_collector(
     policy: TensorDictModuleBase,
     total_frames: int,
     seed: int,
-) -> RobotCollector | RobotMultiCollector:
+    warmup_frames: int,
+    device: torch.device,
+) -> FrameSource:
     """Build the collector that a config describes.
 
     Args:
-        config: How many robots, in how many processes.
+        config: How many robots, in which processes.
         env: The learner's own; a single process collects from it.
         make_env: Builds the env of a worker from a number of robots and a seed.
-        policy: What acts.
+        policy: What acts; it may change between batches.
         total_frames: Rounded up to whole batches.
         seed: Seeds the robots and the exploration of each worker.
+        warmup_frames: So many frames, rounded up to whole batches, have random actions.
+        device: Where the policy is; robots and batches are on the CPU.
 
     Raises:
-        UserError: If robots or steps cannot be shared out evenly.
+        UserError: If robots or steps cannot be shared out evenly, or if Ray does not start.
     """
     robots, frames, processes = config.num_envs, config.frames_per_batch, config.processes
     if robots % processes:
         raise UserError(f"collector.num_envs ({robots}) must be a multiple of collector.processes ({processes})")
     if frames % robots:
         raise UserError(f"collector.frames_per_batch ({frames}) must be a multiple of collector.num_envs ({robots})")
-    total_frames = -(-total_frames // frames) * frames
-    if processes == 1:
-        return RobotCollector(
-            env,
-            policy,
-            frames_per_batch=frames,
-            total_frames=total_frames,
-            track_traj_ids=False,
-            auto_register_policy_transforms=False,
-        )
+    sizes = {
+        "frames_per_batch": frames,
+        "total_frames": -(-total_frames // frames) * frames,
+        "init_random_frames": -(-warmup_frames // frames) * frames,
+    }
+    if config.here:
+        cpu = torch.device("cpu")
+        # Named devices are cast to at every step; where all is on the CPU, nothing needs to be.
+        devices = {} if device == cpu else {"policy_device": device, "env_device": cpu, "storing_device": cpu}
+        return RobotCollector(env, policy, auto_register_policy_transforms=False, **sizes, **devices)
 
     def make_worker_env(worker: int) -> TransformedRobotEnv:
+        torch.set_num_threads(1)
         torch.manual_seed(derive(seed, "exploration", worker))
         return make_env(robots // processes, derive(seed, "train", worker))
 
-    return RobotMultiCollector(processes, make_worker_env, policy, env.normalization.normalizer, frames, total_frames)
+    parts = processes, make_worker_env, policy, env.normalization.normalizer
+    if config.ray_init is not None:
+        return _ray_collector(config.ray_init)(*parts, **sizes)
+    return (RobotMultiSyncCollector if config.sync else RobotMultiAsyncCollector)(*parts, **sizes)

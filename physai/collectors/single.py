@@ -13,6 +13,20 @@ class RobotCollector(Collector):
     so that one set of statistics holds for the whole batch.
     """
 
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs, track_traj_ids=False)
+        self._draw_action = self.env.rand_action
+        self.env.rand_action = self._act_at_random
+
+    def _act_at_random(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Draw the actions of ``init_random_frames``.
+
+        The policy acts, too, and is not obeyed: what it remembers goes on, and all batches have the same keys.
+        """
+        seen = tensordict if self.policy_device is None else tensordict.to(self.policy_device)
+        output = self._wrapped_policy(seen).select(*self._policy_output_keys)
+        return self._draw_action(tensordict.update(output.to(self.env_device) if self.policy_device else output))
+
     def rollout(self) -> TensorDictBase:
         """Collect one batch."""
         self._carrier.set("normalized_observation", self.env.normalization.normalizer(self._carrier.get("observation")))

@@ -20,6 +20,7 @@ from physai.errors import UserError
 
 _LATE = 3.0  # periods
 _STILL = 3  # updates in a row at the same time
+_STEP = 0.75  # periods; what is asked again sooner is the same step of a policy that remembers
 _MOVED = 0.1  # tolerances; a goal that moves by less is still the same
 
 
@@ -56,6 +57,9 @@ class Controller:
     On any doubt it commands zero velocity: at once, whatever the acceleration limit. From a hold it recovers by
     itself; from a fault and an emergency stop only by ``reset``, and a new goal.
 
+    What a policy remembers begins with zeros, as its episodes did: at a new goal, and after every tick at which it did
+    not drive.
+
     Args:
         policy: From :func:`physai.deploy.load_policy`.
         config: Limits and timeouts.
@@ -85,6 +89,9 @@ class Controller:
         self._received = -math.inf
         self._goal: np.ndarray | None = None
         self._reached = False
+        self._nothing = np.zeros(policy.metadata.memory_size, np.float32)
+        self._memory = self._nothing
+        self._step = 0.0  # s since the memory's last one
         self._needed = 0  # good joint states until a hold ends
         self._hold_reason = ""
         self._failures = 0  # of the policy, in a row
@@ -136,18 +143,18 @@ class Controller:
         if self._position is not None and now - self._received > self.config.state_timeout:
             reasons.append(self._hold("state old", f"the last joint state is {now - self._received:.3f} s old"))
         state = self._state(interlocks, reasons)
-        velocity = self._zeros
+        velocity, memory = self._zeros, self._nothing
         if state is State.ACTIVE:
             if not stop:
-                velocity = self._drive(elapsed, reasons)
+                velocity, memory = self._drive(elapsed, reasons)
             state = State.REACHED if self._reached else State.ACTIVE
         if self._latched not in (None, state):  # an emergency stop while the policy was asked, or a policy that failed
-            velocity, state = self._zeros, self._latched
+            velocity, memory, state = self._zeros, self._nothing, self._latched
             reasons.append(self._latch_reason)
         if state is not self._command.state:
             self._since = self._now or 0.0
             self._counters[f"entered {state.value}"] += 1
-        self._last = velocity
+        self._last, self._memory = velocity, memory
         unheard = state is State.WAITING and self._position is None
         self._command = Command(None if unheard else velocity.copy(), state, tuple(reasons))
         return self._command
@@ -224,6 +231,7 @@ class Controller:
         tolerance = self.policy.metadata.goal_tolerance
         if self._goal is None or np.abs(new - self._goal).max() > _MOVED * tolerance:
             self._reached = False
+            self._memory = self._nothing
         self._goal = new
 
     def _take_state(self, now: float, joint_state: JointState, timely: bool, reasons: list[str]) -> None:
@@ -278,8 +286,8 @@ class Controller:
             reasons.append("no goal yet")
         return State.WAITING if interlocks or self._goal is None else State.ACTIVE
 
-    def _drive(self, elapsed: float, reasons: list[str]) -> np.ndarray:
-        """Ask the policy, and limit what it wants."""
+    def _drive(self, elapsed: float, reasons: list[str]) -> tuple[np.ndarray, np.ndarray]:
+        """Ask the policy, and limit what it wants; return the velocity, and what the policy remembers."""
         assert self._position is not None
         assert self._goal is not None
         started = self._stopwatch()
@@ -290,15 +298,19 @@ class Controller:
                 return self._policy_failed("distance", f"gave the distance {distance}", reasons)
             self._reached = distance < tolerance * (self.config.reached_hysteresis if self._reached else 1.0)
             if self._reached:
-                return self._zeros
-            wanted = np.asarray(self.policy(self._position, self._velocity, self._goal), dtype=np.float64)
+                return self._zeros, self._nothing
+            wanted, memory = self._ask(self._position, self._velocity, self._goal)
         except Exception as error:  # a policy is a foreign program
             return self._policy_failed("exception", f"raised {type(error).__name__}: {_last_line(error)}", reasons)
         took = self._stopwatch() - started
         if wanted.shape != self._zeros.shape:
             return self._policy_failed("shape", f"gave the shape {list(wanted.shape)}", reasons)
+        if memory.shape != self._nothing.shape:
+            return self._policy_failed("shape", f"gave a memory of the shape {list(memory.shape)}", reasons)
         if not np.isfinite(wanted).all():
             return self._policy_failed("not finite", "gave a velocity that is not finite", reasons)
+        if not np.isfinite(memory).all():
+            return self._policy_failed("not finite", "gave a memory that is not finite", reasons)
         if took > self.config.policy_timeout:
             return self._policy_failed("slow", f"took {took * 1e3:.1f} ms", reasons)
         self._failures = 0
@@ -309,15 +321,29 @@ class Controller:
         if held_back is not None:
             self._counters["ticks at a position limit"] += 1
             reasons.append(held_back)
-        return velocity
+        return velocity, self._remember(memory, elapsed)
 
-    def _policy_failed(self, kind: str, what: str, reasons: list[str]) -> np.ndarray:
+    def _remember(self, memory: np.ndarray, elapsed: float) -> np.ndarray:
+        """Return the new memory, or the old one: who asks more often than in training must not make time run faster."""
+        self._step += elapsed
+        if self._step < _STEP * self._period:
+            return self._memory
+        self._step -= self._period
+        return memory
+
+    def _ask(self, position: np.ndarray, velocity: np.ndarray, goal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        if not self.policy.metadata.memory_size:
+            return np.asarray(self.policy(position, velocity, goal), dtype=np.float64), self._nothing
+        wanted, memory = self.policy(position, velocity, goal, self._memory)
+        return np.asarray(wanted, dtype=np.float64), np.asarray(memory, dtype=np.float32)
+
+    def _policy_failed(self, kind: str, what: str, reasons: list[str]) -> tuple[np.ndarray, np.ndarray]:
         self._counters[f"policy failures: {kind}"] += 1
         self._failures += 1
         reasons.append(f"the policy {what}")
         if self._failures >= self.config.policy_failures:
             self._fault("policy", f"the policy failed {self._failures} times in a row; at last it {what}")
-        return self._zeros
+        return self._zeros, self._nothing
 
 
 def smallest_margin(max_velocity: float, state_timeout: float, period: float) -> float:

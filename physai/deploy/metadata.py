@@ -14,6 +14,7 @@ FORMAT = "physai.policy"
 FORMAT_VERSION = 1
 INPUTS = ("joint_position", "joint_velocity", "goal")
 OUTPUT = "joint_velocity_command"
+MEMORY, NEW_MEMORY = "memory", "new_memory"  # of a policy that remembers: a further input, a further output
 DISTANCE = "distance"  # of the end effector to the goal, which the controller asks for
 UNITS = {
     "joint_position": "rad",
@@ -24,6 +25,7 @@ UNITS = {
     "effort": "N m",
 }
 MAX_PAIRS = 1000
+MAX_MEMORY = 65536  # numbers
 # What a controller does not need, but people do.
 _TOLD = {
     "robot.urdf_sha256": str,
@@ -60,8 +62,10 @@ class Metadata:
         goal_frame: Link in whose frame goals are given.
         goal_radius: Nearest and farthest goal from that frame's origin, m.
         goal_tolerance: Distance that counts as reached, m.
+        memory_size: How many numbers the policy remembers from step to step, H; 0 for most. An episode begins with
+            zeros.
         golden: Inputs, and the command and distance that the policy gave for them when it was exported; float32,
-            [pairs, n], [pairs, 2], [pairs, 1].
+            [pairs, n], [pairs, 2], [pairs, 1]; also the memory before and after, [pairs, H], if there is one.
         content_sha256: Hash of the code and weights that this describes.
     """
 
@@ -76,8 +80,19 @@ class Metadata:
     goal_frame: str
     goal_radius: tuple[float, float]
     goal_tolerance: float
+    memory_size: int
     golden: dict[str, np.ndarray]
     content_sha256: str
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """What the policy takes, in order."""
+        return inputs(self.memory_size)
+
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        """What it gives, in order."""
+        return outputs(self.memory_size)
 
     @classmethod
     def parse(cls, text: str) -> "Metadata":
@@ -107,11 +122,12 @@ class Metadata:
         inner, outer = _array(raw, "goal.radius", (2,))
         if not 0 <= inner <= outer:
             raise PolicyError("metadata: goal.radius must be an inner and an outer radius")
-        sizes = {"joint_position": n, "joint_velocity": n, "goal": 2, OUTPUT: n}
-        for key, size in sizes.items():
-            side = "outputs" if key == OUTPUT else "inputs"
-            if _get(raw, side, dict).get(key) != ["N", size] or len(raw[side]) != (1 if key == OUTPUT else 3):
-                raise PolicyError(f"metadata: {side} must be {[k for k in sizes if (k == OUTPUT) == (key == OUTPUT)]}")
+        memory_size = _memory_size(raw)
+        sizes = {"joint_position": n, "joint_velocity": n, "goal": 2, OUTPUT: n, MEMORY: memory_size}
+        sizes[NEW_MEMORY] = memory_size
+        for side, keys in (("inputs", inputs(memory_size)), ("outputs", outputs(memory_size))):
+            if _get(raw, side, dict) != {key: ["N", sizes[key]] for key in keys}:
+                raise PolicyError(f"metadata: {side} must be {list(keys)}")
         if _get(raw, "units", dict) != UNITS:
             raise PolicyError(f"metadata: units must be {UNITS}")
         for key, kind in _TOLD.items():
@@ -120,6 +136,7 @@ class Metadata:
         if not 0 < pairs <= MAX_PAIRS:
             raise PolicyError(f"metadata: there are {pairs:,} golden pairs, not 1 to {MAX_PAIRS:,}")
         sizes[DISTANCE] = 1
+        recorded = (*inputs(memory_size), *outputs(memory_size), DISTANCE)
         found = cls(
             raw=raw,
             robot=_get(raw, "robot.name", str),
@@ -132,7 +149,8 @@ class Metadata:
             goal_frame=_get(raw, "goal.frame", str),
             goal_radius=(float(inner), float(outer)),
             goal_tolerance=float(_positive(raw, "goal.tolerance", (), outer)),
-            golden={key: _array(raw, f"golden.{key}", (pairs, size), kind=np.float32) for key, size in sizes.items()},
+            memory_size=memory_size,
+            golden={key: _array(raw, f"golden.{key}", (pairs, sizes[key]), kind=np.float32) for key in recorded},
             content_sha256=_get(raw, "content_sha256", str),
         )
         if not (found.command_limit <= found.velocity_limit).all():
@@ -140,6 +158,16 @@ class Metadata:
         if _get(raw, "metadata_sha256", str) != metadata_sha256(raw):
             raise PolicyError("the metadata is not what was exported (metadata_sha256 differs)")
         return found
+
+
+def inputs(memory_size: int) -> tuple[str, ...]:
+    """What a policy takes, in order."""
+    return (*INPUTS, MEMORY) if memory_size else INPUTS
+
+
+def outputs(memory_size: int) -> tuple[str, ...]:
+    """What a policy gives, in order."""
+    return (OUTPUT, NEW_MEMORY) if memory_size else (OUTPUT,)
 
 
 def metadata_sha256(raw: dict[str, Any]) -> str:
@@ -157,6 +185,15 @@ def _get(raw: dict[str, Any], key: str, kind: type) -> Any:
     if not isinstance(value, kind):
         raise PolicyError(f"metadata: {key} must be a {kind.__name__}")
     return value
+
+
+def _memory_size(raw: dict[str, Any]) -> int:
+    if MEMORY not in _get(raw, "inputs", dict):
+        return 0
+    match raw["inputs"][MEMORY]:
+        case ["N", int(size)] if 0 < size <= MAX_MEMORY and size is not True:
+            return size
+    raise PolicyError(f"metadata: inputs.{MEMORY} must be ['N', H], H at most {MAX_MEMORY:,}")
 
 
 def _array(

@@ -6,7 +6,7 @@ import os
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, overload
 
 import numpy as np
 import torch
@@ -26,11 +26,14 @@ GOLDEN_TOLERANCE = 1e-4  # rad/s and m
 class Policy:
     """From what one robot senses to its joint velocities; of :func:`load_policy`. Not for several threads at once.
 
+    A policy that remembers keeps nothing itself: it takes a memory, and gives the memory for the next call.
+
     Attributes:
         metadata: What the file says about itself.
         sha256: Hash of the file.
         golden_error: Largest difference to the recorded commands on this machine, rad/s; 0.0 if all bits agree.
-        module: The TorchScript module, for batches: float32 tensors [N, n], [N, n], [N, 2] to [N, n].
+        module: The TorchScript module, for batches: float32 tensors [N, n], [N, n], [N, 2] to [N, n]; of a policy that
+            remembers, also [N, H] to [N, H].
     """
 
     def __init__(self, module: torch.jit.ScriptModule, metadata: Metadata, sha256: str) -> None:
@@ -40,19 +43,36 @@ class Policy:
         self.golden_error = 0.0
         n = len(metadata.joints)
         # Each array shares its memory with the tensor beside it: filling it is cheaper than making tensors.
-        self._position, self._velocity, self._goal = (np.zeros((1, size), np.float32) for size in (n, n, 2))
-        self._tensors = [torch.from_numpy(array) for array in (self._position, self._velocity, self._goal)]
+        arrays = [np.zeros((1, size), np.float32) for size in (n, n, 2, metadata.memory_size)]
+        self._position, self._velocity, self._goal, self._memory = arrays
+        self._tensors = [torch.from_numpy(array) for array in arrays[: len(metadata.inputs)]]
 
-    def __call__(self, joint_position: Vector, joint_velocity: Vector, goal: Vector) -> np.ndarray:
+    @overload
+    def __call__(self, joint_position: Vector, joint_velocity: Vector, goal: Vector) -> np.ndarray: ...
+
+    @overload
+    def __call__(
+        self, joint_position: Vector, joint_velocity: Vector, goal: Vector, memory: Vector
+    ) -> tuple[np.ndarray, np.ndarray]: ...
+
+    def __call__(
+        self, joint_position: Vector, joint_velocity: Vector, goal: Vector, memory: Vector | None = None
+    ) -> np.ndarray | tuple[np.ndarray, np.ndarray]:
         """Map positions [n] rad, velocities [n] rad/s and a goal [2] m to velocity commands [n], rad/s, float32.
 
+        A policy that remembers also takes a memory [H], zeros where an episode begins, and gives the new one, [H].
+
         Raises:
-            ValueError: If one of them has another length.
+            ValueError: If one of them has another length, or is missing.
         """
         _fill(self._position, joint_position)
         _fill(self._velocity, joint_velocity)
         _fill(self._goal, goal)
-        return self.module(*self._tensors)[0].numpy()
+        if memory is None and not self.metadata.memory_size:
+            return self.module(*self._tensors)[0].numpy()
+        _fill(self._memory, () if memory is None else memory)
+        command, new_memory = self.module(*self._tensors)
+        return command[0].numpy(), new_memory[0].numpy()
 
     def distance(self, joint_position: Vector, goal: Vector) -> float:
         """Distance of the end effector to a goal [2] m at joint positions [n] rad, in m.
@@ -68,7 +88,7 @@ class Policy:
         """Wrap the module for TorchRL code, with its keys; needs tensordict."""
         from tensordict.nn import TensorDictModule
 
-        return TensorDictModule(self.module, in_keys=list(INPUTS), out_keys=[OUTPUT])
+        return TensorDictModule(self.module, in_keys=list(self.metadata.inputs), out_keys=list(self.metadata.outputs))
 
 
 def _fill(row: np.ndarray, values: Vector) -> None:
@@ -117,7 +137,7 @@ def load_policy(path: str | Path, sha256: str | None = None, expect_joints: Sequ
         how = "with its joints in another order" if set(joints) == set(metadata.joints) else "for other joints"
         raise PolicyError(f"{path}: a policy {how}: {list(metadata.joints)}, not {list(joints)}")
     try:
-        policy = Policy(load_module(checked.content), metadata, digest)
+        policy = Policy(load_module(checked.content, metadata.inputs), metadata, digest)
         policy.golden_error = _golden_error(policy)
     except PolicyError as error:
         raise PolicyError(f"{path}: {error}") from None
@@ -144,8 +164,12 @@ def _described(path: Path, checked: archive.Archive) -> Metadata:
     return metadata
 
 
-def load_module(content: bytes) -> torch.jit.ScriptModule:
+def load_module(content: bytes, inputs: Sequence[str] = INPUTS) -> torch.jit.ScriptModule:
     """Load the TorchScript of a policy file that has been checked, or that is not written yet.
+
+    Args:
+        content: Of the file.
+        inputs: What the policy takes.
 
     Raises:
         PolicyError: If its methods are not those of a policy.
@@ -154,7 +178,7 @@ def load_module(content: bytes) -> torch.jit.ScriptModule:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)  # of TorchScript
         module = torch.jit.load(io.BytesIO(content), map_location="cpu").eval()
-        for method, arguments in (("forward", INPUTS), ("distance", ("joint_position", "goal"))):
+        for method, arguments in (("forward", inputs), ("distance", ("joint_position", "goal"))):
             found = [a.name for a in getattr(module, method).schema.arguments[1:]] if hasattr(module, method) else None
             if found != list(arguments):
                 raise PolicyError(f"its {method} takes {found}, not {list(arguments)}")
@@ -166,20 +190,28 @@ def load_module(content: bytes) -> torch.jit.ScriptModule:
 
 def _golden_error(policy: Policy) -> float:
     """Run all pairs, thrice: the first calls also let TorchScript's profiling executor settle."""
-    golden, worst = policy.metadata.golden, 0.0
-    for _ in range(3):
-        for *inputs, (distance,), expected in zip(*(golden[key] for key in (*INPUTS, DISTANCE, OUTPUT)), strict=True):
-            command = policy(*inputs)
-            if command.shape != expected.shape or command.dtype != np.float32:
-                raise PolicyError(f"it gives {command.dtype} {list(command.shape)}, not float32 {list(expected.shape)}")
-            error = float(np.abs(command - expected).max())
+    golden, metadata, worst = policy.metadata.golden, policy.metadata, 0.0
+    pairs = [dict(zip(golden, values, strict=True)) for values in zip(*golden.values(), strict=True)]
+    for pair in pairs * 3:
+        inputs = [pair[key] for key in metadata.inputs]
+        answer = policy(*inputs)
+        for key, found in zip(metadata.outputs, answer if metadata.memory_size else (answer,), strict=True):
+            expected = pair[key]
+            if found.shape != expected.shape or found.dtype != np.float32:
+                raise PolicyError(f"it gives {found.dtype} {list(found.shape)}, not float32 {list(expected.shape)}")
+            error = float(np.abs(found - expected).max())
             if not error <= GOLDEN_TOLERANCE:  # also where it is NaN
                 raise PolicyError(
-                    f"a golden pair differs by {error:.3g} rad/s: at {[x.tolist() for x in inputs]} it gives "
-                    f"{command.tolist()}, and gave {expected.tolist()} when it was exported"
+                    f"a golden pair differs by {error:.3g}{' rad/s' if key == OUTPUT else f' in {key}'}: at "
+                    f"{_shown(*inputs)} it gives {_shown(found)}, and gave {_shown(expected)} when it was exported"
                 )
-            gap = abs(policy.distance(inputs[0], inputs[2]) - distance)
-            if not gap <= GOLDEN_TOLERANCE:
-                raise PolicyError(f"the distance of a golden pair differs by {gap:.3g} m")
             worst = max(worst, error)
+        gap = abs(policy.distance(pair["joint_position"], pair["goal"]) - pair[DISTANCE][0])
+        if not gap <= GOLDEN_TOLERANCE:
+            raise PolicyError(f"the distance of a golden pair differs by {gap:.3g} m")
     return worst
+
+
+def _shown(*arrays: np.ndarray) -> str:
+    """Numbers for an error message; of a memory, the first ones."""
+    return ", ".join(f"{array[:8].tolist()}{'...' if len(array) > 8 else ''}" for array in arrays)

@@ -16,6 +16,7 @@ from physai.seeding import derive
 from physai.transforms import (
     ActuatorDelay,
     DomainRandomization,
+    Memory,
     Observation,
     ObservationNormalization,
     SensorModel,
@@ -99,6 +100,7 @@ def make_env(
     normalization: NormalizationConfig,
     num_envs: int,
     seed: int,
+    memory_size: int = 0,
 ) -> TransformedRobotEnv:
     """Put N robots, their randomization, sensors, observation and its normalization together.
 
@@ -108,6 +110,7 @@ def make_env(
         normalization: How observations are normalized.
         num_envs: N.
         seed: Seeds every source of randomness in the env.
+        memory_size: How many numbers the policy remembers from step to step.
     """
     base = RobotEnv(env, num_envs)
     layout = base.simulation.layout
@@ -123,6 +126,8 @@ def make_env(
     made = TransformedRobotEnv(base, Compose(*transforms))
     size = made.observation_spec["observation"].shape[-1]
     made.append_transform(ObservationNormalization(size, normalization.eps, normalization.clip))
+    if memory_size:
+        made.append_transform(Memory(memory_size, num_envs))
     made.set_seed(seed)
     return made
 

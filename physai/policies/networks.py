@@ -25,16 +25,32 @@ def input_size(observation_spec: Composite, in_keys: Sequence[str], where: str) 
 
 
 def mlp(
-    in_features: int, hidden_sizes: Sequence[int], out_features: int, activation: str, last_gain: float = 1.0
+    in_features: int,
+    hidden_sizes: Sequence[int],
+    out_features: int,
+    activation: str,
+    last_gain: float = 1.0,
+    orthogonal: bool = True,
 ) -> nn.Sequential:
-    """Build a perceptron with orthogonal weights (Saxe et al., 2014) and zero biases."""
+    """Build a perceptron.
+
+    Args:
+        in_features: Numbers that go in.
+        hidden_sizes: Widths of the hidden layers.
+        out_features: Numbers that come out.
+        activation: A ``torch.nn`` module's name.
+        last_gain: Of the weights of the last layer, if they are orthogonal.
+        orthogonal: Orthogonal weights (Saxe et al., 2014) and zero biases, as on-policy algorithms like them; else
+            torch's own, uniform ones.
+    """
     module, _, name = activation.rpartition(".")
     nonlinearity = getattr(importlib.import_module(module or "torch.nn"), name)
+    linear = _linear if orthogonal else lambda inputs, outputs, _: nn.Linear(inputs, outputs)
     layers: list[nn.Module] = []
     for size in hidden_sizes:
-        layers += [_linear(in_features, size, 2**0.5), nonlinearity()]
+        layers += [linear(in_features, size, 2**0.5), nonlinearity()]
         in_features = size
-    return nn.Sequential(*layers, _linear(in_features, out_features, last_gain))
+    return nn.Sequential(*layers, linear(in_features, out_features, last_gain))
 
 
 def _linear(in_features: int, out_features: int, gain: float) -> nn.Linear:
@@ -88,7 +104,7 @@ class GaussianActor(TensorDictModuleBase):
 
     def mean(self, tensordict: TensorDictBase) -> Tensor:
         """Mean of the latent action, [.., n]."""
-        return self.network(_inputs(tensordict, self.in_keys))
+        return self.network(side_by_side(tensordict, self.in_keys))
 
     def get_dist(self, tensordict: TensorDictBase) -> Distribution:
         """Return the distribution of the latent action."""
@@ -99,7 +115,10 @@ class GaussianActor(TensorDictModuleBase):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Act."""
-        mean = self.mean(tensordict)
+        return self.act(tensordict, self.mean(tensordict))
+
+    def act(self, tensordict: TensorDictBase, mean: Tensor) -> TensorDictBase:
+        """Draw around a mean of the latent action, [.., n]."""
         noise = torch.randn_like(mean) if exploration_type() == ExplorationType.RANDOM else torch.zeros_like(mean)
         latent = torch.addcmul(mean, self.log_std.exp(), noise)
         log_prob = -0.5 * noise.square().sum(-1) - (self.log_std + _HALF_LOG_TWO_PI).sum()
@@ -112,7 +131,7 @@ _HALF_LOG_TWO_PI = 0.9189385332046727
 
 
 class Critic(TensorDictModuleBase):
-    """Writes ``state_value`` [.., 1], the expected return.
+    """Writes the expected return [.., 1]: ``state_value``, or ``state_action_value`` if it sees ``action``.
 
     Args:
         in_features: Numbers that ``in_keys`` bring.
@@ -120,8 +139,6 @@ class Critic(TensorDictModuleBase):
         hidden_sizes: Widths of the hidden layers.
         activation: A ``torch.nn`` module's name.
     """
-
-    out_keys = ("state_value",)
 
     def __init__(
         self,
@@ -132,13 +149,17 @@ class Critic(TensorDictModuleBase):
     ) -> None:
         super().__init__()
         self.in_keys = in_keys
-        self.network = mlp(in_features, hidden_sizes, 1, activation)
+        judges_actions = "action" in in_keys
+        self.out_keys = ["state_action_value" if judges_actions else "state_value"]
+        # TorchRL draws the weights of twin critics anew, uniformly, from the range that it finds.
+        self.network = mlp(in_features, hidden_sizes, 1, activation, orthogonal=not judges_actions)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Judge."""
-        return tensordict.set("state_value", self.network(_inputs(tensordict, self.in_keys)))
+        return tensordict.set(self.out_keys[0], self.network(side_by_side(tensordict, self.in_keys)))
 
 
-def _inputs(tensordict: TensorDictBase, in_keys: Sequence[str]) -> Tensor:
+def side_by_side(tensordict: TensorDictBase, in_keys: Sequence[str]) -> Tensor:
+    """Return what a network sees: the values of its keys, [.., in_features]."""
     values = [tensordict.get(key) for key in in_keys]
     return values[0] if len(values) == 1 else torch.cat(values, dim=-1)

@@ -11,8 +11,9 @@ import torch
 from hydra.errors import InstantiationException
 from hydra.utils import instantiate
 from tensordict.nn import TensorDictModuleBase
+from torchrl.data import Composite
 
-from physai.algorithms import OnPolicy
+from physai.algorithms import Algorithm, Networks
 from physai.collectors import RobotCollector, RobotMultiCollector, make_collector
 from physai.envs.make import TransformedRobotEnv, make_env
 from physai.errors import UserError
@@ -31,7 +32,7 @@ class Agent:
     env: TransformedRobotEnv
     actor: TensorDictModuleBase
     critic: TensorDictModuleBase
-    algorithm: OnPolicy
+    algorithm: Algorithm
     collector: RobotCollector | RobotMultiCollector
 
     @classmethod
@@ -48,16 +49,17 @@ class Agent:
             )
         torch.set_num_threads(config.threads)
         torch.manual_seed(derive(config.seed, "learner"))
-        make_robots = partial(make_env, config.env, config.randomization, config.normalization)
+        memory = config.policy.memory_size
+        make_robots = partial(make_env, config.env, config.randomization, config.normalization, memory_size=memory)
         env = make_robots(config.collector.robots_here, derive(config.seed, "train"))
         actor = make_actor(config, env)
-        inputs = input_size(env.observation_spec, config.policy.critic["in_keys"], "policy.critic")
+        judged = Composite(**env.observation_spec, **env.full_action_spec, shape=env.batch_size)
+        inputs = input_size(judged, config.policy.critic["in_keys"], "policy.critic")
         critic = _make("policy.critic", config.policy.critic, in_features=inputs)
         algorithm = _make(
             "algo",
             config.algo,
-            actor=actor,
-            critic=critic,
+            networks=Networks(actor, critic, env.normalization.normalizer),
             frames_per_batch=config.collector.frames_per_batch,
         )
         collector = make_collector(config.collector, env, make_robots, actor, config.total_frames, config.seed)
@@ -66,8 +68,8 @@ class Agent:
     def weights_sha256(self) -> str:
         """Hash of the networks' weights and the normalization statistics."""
         digest = hashlib.sha256()
-        for module in (self.actor, self.critic, self.env.normalization):
-            for name, value in sorted(module.state_dict().items()):
+        for weights in (self.algorithm.weights(), self.env.normalization.state_dict()):
+            for name, value in sorted(weights.items()):
                 digest.update(name.encode())
                 digest.update(value.contiguous().numpy().tobytes())
         return digest.hexdigest()
@@ -104,7 +106,8 @@ def make_evaluation_env(
     config: TrainConfig, randomization: RandomizationConfig, num_envs: int, seed: int
 ) -> TransformedRobotEnv:
     """Build an env of its own for evaluation, with random numbers that training never uses."""
-    return make_env(config.env, randomization, config.normalization, num_envs, derive(seed, "evaluation"))
+    seed = derive(seed, "evaluation")
+    return make_env(config.env, randomization, config.normalization, num_envs, seed, config.policy.memory_size)
 
 
 def make_logger(config: TrainConfig, run_dir: Path) -> Any:
@@ -114,7 +117,7 @@ def make_logger(config: TrainConfig, run_dir: Path) -> Any:
 
 def _make(where: str, node: dict[str, Any], **parts: Any) -> Any:
     try:
-        return instantiate(node, **parts, _convert_="all")
+        return instantiate(node, _partial_=True, _convert_="all")(**parts)  # Hydra would make dicts of dataclasses
     except InstantiationException as error:
         cause = error.__cause__ or error
         if isinstance(cause, UserError):

@@ -31,6 +31,11 @@ class PolicyConfig(Config):
     actor: Target
     critic: Target
 
+    @property
+    def memory_size(self) -> int:
+        """How many numbers the actor remembers from step to step."""
+        return int(self.actor.get("memory_size", 0))
+
 
 class TrainConfig(Config):
     """Everything that decides the outcome of a run."""

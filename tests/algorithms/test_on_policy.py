@@ -4,7 +4,6 @@ import math
 
 import pytest
 import torch
-from hydra.utils import instantiate
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
@@ -13,6 +12,7 @@ from physai.algorithms import NonFiniteError, OnPolicy
 from physai.config import compose
 from physai.errors import UserError
 from physai.policies import Critic, GaussianActor
+from tests.algorithms.assemble import assemble
 
 GAMMA, LAMBDA = 0.9, 0.8
 
@@ -33,7 +33,7 @@ class ReadValue(TensorDictModuleBase):
 
 def build(actor, critic, frames, *overrides):
     node = compose("train", [f"collector.frames_per_batch={frames}", f"algo.minibatch_size={frames}", *overrides])
-    return instantiate(node.algo, actor=actor, critic=critic, frames_per_batch=frames, _convert_="all")
+    return assemble(node.algo, actor, critic, frames)
 
 
 def test_advantages_bootstrap_on_truncation_and_not_on_termination():
@@ -197,9 +197,8 @@ def _saved(state):
 def test_a_minibatch_larger_than_the_batch_is_refused():
     actor, critic, _ = small_batch()
     node = compose("train", ["collector.frames_per_batch=4096", "algo.minibatch_size=5000"])
-    with pytest.raises(Exception, match="minibatch of 5000 is larger") as caught:
-        instantiate(node.algo, actor=actor, critic=critic, frames_per_batch=4096, _convert_="all")
-    assert isinstance(caught.value.__cause__, UserError)
+    with pytest.raises(UserError, match="minibatch of 5000 is larger"):
+        assemble(node.algo, actor, critic, 4096)
 
 
 def test_any_torchrl_part_can_be_swapped_from_the_command_line():
@@ -214,5 +213,5 @@ def test_any_torchrl_part_can_be_swapped_from_the_command_line():
     ]
     algorithm = build(actor, critic, 32, *overrides)
     assert isinstance(algorithm, OnPolicy)
-    assert type(algorithm.optimizer) is torch.optim.AdamW
+    assert type(algorithm.descent.optimizer) is torch.optim.AdamW
     assert math.isfinite(algorithm.update(batch)["loss_objective"])

@@ -2,7 +2,6 @@
 
 import pytest
 import torch
-from hydra.utils import instantiate
 from tensordict import TensorDict
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.objectives import ClipPPOLoss
@@ -10,6 +9,7 @@ from torchrl.objectives import ClipPPOLoss
 from physai.algorithms import FusedClipPPOLoss
 from physai.config import compose
 from physai.policies import Critic, GaussianActor
+from tests.algorithms.assemble import assemble
 
 SETTINGS = {"clip_epsilon": 0.1, "entropy_coeff": 0.03, "critic_coeff": 0.7}
 
@@ -56,7 +56,7 @@ def test_torchrl_s_loss_can_be_put_in_its_place_by_config(parts):
     results = []
     for overrides in ([], swap):
         node = compose("train", ["collector.frames_per_batch=64", "algo.minibatch_size=64", *overrides])
-        algorithm = instantiate(node.algo, actor=actor, critic=critic, frames_per_batch=64, _convert_="all")
+        algorithm = assemble(node.algo, actor, critic, 64)
         results.append(algorithm.loss(frames))
     assert type(algorithm.loss) is ClipPPOLoss
     for key in ("loss_objective", "loss_critic", "loss_entropy"):

@@ -1,0 +1,130 @@
+"""What collectors whose processes are forked from the learner's have in common."""
+
+import ctypes
+import os
+import signal
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import partial
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import multiprocessing
+
+from physai.collectors.worker import Acting, MakeEnv, WorkerCollector
+from physai.envs.make import TransformedRobotEnv
+from physai.errors import UserError
+from physai.transforms.normalization import Normalizer
+
+
+class RobotMultiCollector:
+    """Several processes on this machine, each with robots of its own; before one of TorchRL's multi-collectors.
+
+    The policy and the normalizer with which a process acts lie in shared memory; the learner renews them between two
+    batches of that process, when it stands still: no lock is needed that a killed process could keep.
+
+    Args:
+        workers: Number of processes.
+        make_env: See :data:`physai.collectors.worker.MakeEnv`.
+        policy: What acts; its copies do.
+        normalizer: The learner's; its copies are used.
+        **torchrl: For TorchRL's collector.
+    """
+
+    procs: list[Any]  # TorchRL's
+
+    def __init__(
+        self,
+        workers: int,
+        make_env: MakeEnv,
+        policy: TensorDictModuleBase,
+        normalizer: Normalizer,
+        **torchrl: Any,
+    ) -> None:
+        self._acting = Acting(policy, normalizer)
+        self._copies = [self._acting.copy().share_memory() for _ in range(workers)]
+        threads, method = torch.get_num_threads(), multiprocessing.get_start_method(allow_none=True)
+        # Forked workers start at once; fresh ones would import for seconds.
+        multiprocessing.set_start_method("fork", force=True)
+        try:
+            with self._one_line():
+                super().__init__(
+                    [
+                        partial(_start_worker, os.getpid(), make_env, copy.normalizer, worker)
+                        for worker, copy in enumerate(self._copies)
+                    ],
+                    policy_factory=[partial(_same, copy.policy) for copy in self._copies],
+                    collector_class=WorkerCollector,
+                    use_buffers=True,
+                    auto_register_policy_transforms=False,
+                    **torchrl,
+                )
+        finally:
+            multiprocessing.set_start_method(method, force=True)
+            torch.set_num_threads(threads)  # those are the learner's: TorchRL takes one away for each worker
+
+    def _renew(self, worker: int) -> None:
+        """Let a worker that stands still act as the learner would now."""
+        self._copies[worker].load_state_dict(self._acting.state_dict())
+
+    def iterator(self) -> Iterator[TensorDictBase]:
+        """Collect batches.
+
+        Raises:
+            UserError: If a worker has died.
+        """
+        batches = super().iterator()  # type: ignore[misc]
+        while True:
+            with self._one_line():
+                batch = next(batches, None)
+            if batch is None:
+                return
+            yield batch
+
+    @contextmanager
+    def _one_line(self) -> Iterator[None]:
+        """Context in which whatever TorchRL says of a process that is gone becomes one line; the others end, too."""
+        try:
+            yield
+        except UserError as error:  # a worker's own, with its traceback behind it
+            raise UserError(str(error).partition("\n")[0]) from error
+        except (RuntimeError, ValueError, OSError, EOFError) as error:
+            open_ones = [process for process in getattr(self, "procs", []) if not process._closed]
+            codes = [str(process.exitcode) for process in open_ones if process.exitcode is not None]
+            for process in open_ones:
+                process.kill()
+            reason = f"exit code {', '.join(codes)}" if codes else (str(error) or type(error).__name__).splitlines()[0]
+            raise UserError(f"a process that collects has ended ({reason})") from error
+
+    def state(self) -> dict[str, Any]:
+        """Return the state of all workers."""
+        with self._one_line():
+            return dict(self.state_dict())  # type: ignore[attr-defined]
+
+    def set_state(self, state: dict[str, Any]) -> None:
+        """Restore what ``state`` returned, in a collector made from the same config."""
+        with self._one_line():
+            self.load_state_dict(state)  # type: ignore[attr-defined]
+
+
+def _start_worker(learner: int, make_env: MakeEnv, normalizer: Normalizer, worker: int) -> TransformedRobotEnv:
+    # These reach all processes of a terminal or a container; the learner says what comes of it.
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT):
+        signal.signal(number, signal.SIG_IGN)
+    if sys.platform == "linux":  # pipes do not tell that the learner was killed: each worker holds both ends of others'
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+        if os.getppid() != learner:
+            sys.exit(1)
+    env = make_env(worker)
+    env.normalization.normalizer = normalizer
+    return env
+
+
+_PR_SET_PDEATHSIG = 1
+
+
+def _same(policy: TensorDictModuleBase) -> TensorDictModuleBase:
+    return policy

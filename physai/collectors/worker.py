@@ -1,0 +1,56 @@
+"""What collects in a process of its own, and what acts there."""
+
+from collections.abc import Callable
+from copy import deepcopy
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor, nn
+
+from physai.collectors.single import RobotCollector
+from physai.envs.make import TransformedRobotEnv
+from physai.transforms.normalization import Normalizer
+
+MakeEnv = Callable[[int], TransformedRobotEnv]
+"""Builds the env of a worker from its number, in the worker's process."""
+
+
+class Acting(nn.Module):
+    """What decides how robots act: a policy, and the normalizer of what it sees.
+
+    Each worker has a copy, which follows the learner's between two batches and never in the middle of one.
+    """
+
+    def __init__(self, policy: TensorDictModuleBase, normalizer: Normalizer) -> None:
+        super().__init__()
+        self.policy = policy
+        self.normalizer = normalizer
+
+    def copy(self) -> "Acting":
+        """Return a copy on the CPU, where robots are."""
+        return deepcopy(self).to("cpu")
+
+
+class WorkerCollector(RobotCollector):
+    """What collects in a worker."""
+
+    def rollout(self) -> TensorDictBase:
+        """Collect one batch."""
+        batch = super().rollout()
+        # TorchRL counts frames by this key; what it says of trajectories nobody asks.
+        return batch.set(("collector", "traj_ids"), torch.zeros(batch.shape, dtype=torch.int64))
+
+    def renew(self, weights: dict[str, Tensor]) -> None:
+        """Act from now on as an :class:`Acting` does whose ``state_dict`` this is."""
+        Acting(self.policy, self.env.normalization.normalizer).load_state_dict(weights)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the state of the env and of this process' random numbers."""
+        return self.state() | {"random": torch.get_rng_state()}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Restore what ``state_dict`` returned."""
+        self.set_state(state_dict)
+        torch.set_rng_state(state_dict["random"])
