@@ -27,7 +27,7 @@ $(VENV)/.installed-ros: $(VENV)/.installed
 
 $(VENV)/.installed-dev: $(VENV)/.installed
 	@echo "==> Installing the tools for tests and benchmarks into $(VENV)"
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev,bench,onnx,ros]'
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev,bench,joblib,mlflow,onnx,optuna,ray,ray-launcher,ros,submitit,wandb]'
 	@touch $@
 
 train: $(VENV)/.installed  ## Train the two-link arm (ARGS="env=kuka_reacher seed=1" for more)

@@ -1,24 +1,32 @@
 """What all commands share: overrides are checked before Hydra creates anything, and a user's error is one line."""
 
 import contextlib
+import functools
 import gc
 import itertools
 import os
+import shutil
 import signal
+import socket
 import sys
+import threading
+import time
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
+from typing import Any
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override
 from hydra.errors import OverrideParseException
 from hydra.types import RunMode
-from omegaconf import DictConfig, open_dict
+from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
-from physai.config import compose, conf_dir
+from physai import study
+from physai.config import compose, conf_dir, jobs_at_once, set_plugin_defaults
 from physai.errors import UserError
 
 _SIGNALS = (signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)
@@ -38,7 +46,8 @@ def main(name: str, job: Job, check: Callable[[DictConfig], object]) -> None:
     if set(flags) <= {"-m", "--multirun"}:
         with guard(), _imports():
             sys.argv += _check_all(name, check, overrides(), sweep=bool(flags))
-    with guard():
+    set_plugin_defaults()
+    with guard(), study.without_result():
         hydra.main(version_base="1.3", config_path=str(conf_dir().absolute()), config_name=name)(_guarded(job))()
 
 
@@ -82,19 +91,30 @@ def _imports() -> Iterator[None]:
 
 def _check_all(name: str, check: Callable[[DictConfig], object], given: list[str], sweep: bool) -> list[str]:
     """Check every job to come; return further overrides that pin down what Hydra would choose anew."""
-    for one in _combinations(given) if sweep else [given]:
-        config = compose(name, one, hydra=True)
-        try:
-            folder = str(config.hydra.sweep.dir if sweep else config.hydra.run.dir)
-        except OmegaConfBaseException as error:
-            raise UserError(" ".join(str(error).split())) from None
+    key = "hydra.sweep.dir" if sweep else "hydra.run.dir"
+    fixed = [one for one in given if not (sweep and _sweeps(one))]
+    whole = compose(name, fixed, hydra=True)
+    try:
+        folder = str(OmegaConf.select(whole, key))
+        searched = study.searched(whole, given) if sweep else None
+    except OmegaConfBaseException as error:
+        raise UserError(" ".join(str(error).split())) from None
+    jobs: Iterable[DictConfig] = [whole]
+    if sweep:
+        every = _combinations(given) if searched is None else _samples([*fixed, *searched])
+        jobs = (compose(name, one, hydra=True) for one in every)
+    launcher = whole.hydra.launcher._target_
+    if sweep and launcher.endswith(".SlurmLauncher") and shutil.which("srun") is None:
+        raise UserError(
+            "hydra/launcher=submitit_slurm: there is no srun here, so this is no computer of a SLURM cluster"
+        )
+    for config in jobs:
         with open_dict(config):
             del config["hydra"]
         check(config)
-    key = "hydra.sweep.dir" if sweep else "hydra.run.dir"
-    if folder == ".":
+    if folder == "." and searched is None:
         return []
-    if any(Path(folder).glob("*/.hydra" if sweep else ".hydra")):
+    if searched is None and any(Path(folder).glob("*/.hydra" if sweep else ".hydra")):
         way_out = f"choose another {key}" if sweep else f"go on with resume={folder}, or choose another {key}"
         raise UserError(f"{folder} holds a run already: {way_out}")
     try:
@@ -103,40 +123,98 @@ def _check_all(name: str, check: Callable[[DictConfig], object], given: list[str
         raise UserError(f"cannot create the run folder {folder}: {error.strerror}") from None
     if not os.access(folder, os.W_OK):
         raise UserError(f"cannot write to the run folder {folder}")
-    return [f"{key}='{folder}'"]
+    pinned = [f"{key}='{folder}'"]
+    if searched is not None:
+        return [*pinned, *study.begin(Path(folder), whole, searched, fixed)]
+    if sweep and launcher.endswith(".LocalLauncher") and whole.hydra.sweeper.max_batch_size is None:
+        pinned.append(f"hydra.sweeper.max_batch_size={jobs_at_once(whole)}")  # submitit would start all jobs at once
+    return pinned
 
 
-def _combinations(given: list[str]) -> Iterator[list[str]]:
+def _sweeps(override: str) -> bool:
     try:
-        parsed = OverridesParser.create().parse_overrides(given)
-    except OverrideParseException as error:
-        raise UserError(f"'{error.override}' is not an override such as key=value") from None
+        return OverridesParser.create().parse_override(override).is_sweep_override()
+    except OverrideParseException:
+        raise UserError(f"'{override}' is not an override such as key=value") from None
+
+
+def _combinations(given: list[str]) -> Iterable[list[str]]:
+    """Every job of a sweep."""
     choices = []
-    for override in parsed:
-        if override.is_sweep_override() and override.is_discrete_sweep():
-            key = override.get_key_element()
-            choices.append([f"{key}={value}" for value in override.sweep_string_iterator()])
-        elif not override.is_sweep_override():
-            choices.append([str(override.input_line)])
+    for override in OverridesParser.create().parse_overrides(given):
+        if override.is_sweep_override() and not override.is_discrete_sweep():
+            raise UserError(f"'{override.input_line}': hydra/sweeper=optuna searches an interval, nothing else does")
+        choices.append(_values(override))
     return (list(one) for one in itertools.product(*choices))
 
 
+def _samples(given: list[str]) -> Iterable[list[str]]:
+    """So many jobs of a search that every choice is in one of them, and something of every interval."""
+    choices = [_values(override) for override in OverridesParser.create().parse_overrides(given)]
+    most = max(len(values) for values in choices)
+    return [[values[min(job, len(values) - 1)] for values in choices] for job in range(most)]
+
+
+def _values(override: Override) -> list[str]:
+    if not override.is_sweep_override():
+        return [str(override.input_line)]
+    key = override.get_key_element()
+    if override.is_discrete_sweep():
+        return [f"{key}={value}" for value in override.sweep_string_iterator()]
+    interval: Any = override.value()
+    low, high = interval.start, interval.end
+    between = (low + high) // 2 if isinstance(low, int) else low + (high - low) / 3
+    return [f"{key}={value}" for value in (low, between, high)]
+
+
 def _guarded(job: Job) -> Callable[[DictConfig], object]:
+    starter, host = os.getpid(), socket.gethostname()
+
     def run(config: DictConfig) -> object:
         context = HydraConfig.get()
+        for library in ("OMP", "MKL", "OPENBLAS"):  # for what this process, or one of the job's, loads from here on
+            os.environ[f"{library}_NUM_THREADS"] = str(config.get("threads", 1))
         folder = Path(context.runtime.output_dir)
         folder = folder.relative_to(Path.cwd()) if folder.is_relative_to(Path.cwd()) else folder
         if context.mode is RunMode.RUN:
             with guard():
                 return job(config, folder)
+        print(f"\n[{context.job.num}] {context.job.override_dirname}", flush=True)
+        here = (os.getpid(), socket.gethostname()) == (starter, host)
+        if not here and socket.gethostname() == host and "SLURM_JOB_ID" not in os.environ:
+            _end_with(starter)
         try:
-            print(f"\n[{context.job.num}] {context.job.override_dirname}", flush=True)
-            return job(config, folder)
+            with contextlib.nullcontext() if here else _output_to(folder / "output.txt"):
+                return job(config, folder)
         except Exception as error:
             # A sweep goes on without the job that failed; its report names it.
             with contextlib.suppress(OSError):
                 (folder / "error.txt").write_text(f"{error}\n\n{traceback.format_exc()}")
-            print(f"error: {error}", file=sys.stderr)
+            print(f"error: [{context.job.num}] {error}", file=sys.stderr)
             return None
 
     return run
+
+
+@functools.cache  # a process may run several jobs
+def _end_with(starter: int) -> None:
+    """Stop this process, as SIGTERM does, once the sweep that it works for is gone; not all launchers see to that."""
+
+    def watch() -> None:
+        while True:
+            time.sleep(1)
+            try:
+                os.kill(starter, 0)
+            except ProcessLookupError:
+                os.kill(os.getpid(), signal.SIGTERM)  # a run saves itself
+                time.sleep(20)
+                os._exit(128 + signal.SIGTERM)
+
+    threading.Thread(target=watch, daemon=True).start()
+
+
+@contextlib.contextmanager
+def _output_to(path: Path) -> Iterator[None]:
+    """Context that keeps apart what jobs print that run at the same time."""
+    with open(path, "w", buffering=1) as file, contextlib.redirect_stdout(file):
+        yield

@@ -1,9 +1,14 @@
 """Composing and checking configuration: values live in ``conf/``, types and ranges in models that inherit Config."""
 
+import contextlib
 import difflib
+import functools
 import importlib
+import importlib.metadata
 import inspect
+import os
 import re
+import types
 import typing
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -11,7 +16,10 @@ from typing import Annotated, Any, TypeVar
 
 from hydra import compose as hydra_compose
 from hydra import initialize_config_dir
+from hydra.core.config_store import ConfigStore
+from hydra.core.plugins import Plugins
 from hydra.errors import HydraException, MissingConfigException, OverrideParseException
+from hydra.plugins.config_source import ConfigLoadError
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 from pydantic import (
@@ -56,13 +64,66 @@ def _ceil_div(number: Any, divisor: Any) -> int:
         return 1
 
 
-OmegaConf.register_new_resolver("ceil_div", _ceil_div)
+def _cores_of_job(threads: int, processes: int) -> int:
+    """Resolver ``${cores_of_job:threads,processes}``: what a run keeps busy."""
+    return max(1, threads * processes)
+
+
+def _jobs_at_once(threads: int, processes: int) -> int:
+    """Resolver ``${jobs_at_once:threads,processes}``: how many runs this computer's cores are enough for."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return max(1, cores // _cores_of_job(threads, processes))
+
+
+def _add(number: int, other: int) -> int:
+    """Resolver ``${add:a,b}``."""
+    return number + other
+
+
+def _search_space(algo: str) -> DictConfig:
+    """Resolver ``${search_space:algo}``: what Optuna looks through; nothing for an algorithm without such a file."""
+    path = conf_dir() / "hydra" / "search" / f"{algo}.yaml"
+    return OmegaConf.load(path) if path.is_file() else OmegaConf.create({})
+
+
+for _resolver in (_add, _ceil_div, _cores_of_job, _jobs_at_once, _search_space):
+    OmegaConf.register_new_resolver(_resolver.__name__.lstrip("_"), _resolver)
+
+
+def jobs_at_once(config: DictConfig) -> int:
+    """How many runs with this config this computer's cores are enough for."""
+    return _jobs_at_once(
+        OmegaConf.select(config, "threads", default=1), OmegaConf.select(config, "collector.processes", default=1)
+    )
 
 
 def conf_dir() -> Path:
     """Return the folder of the YAML files: inside the installed package, or beside it in a checkout."""
     inside = Path(__file__).parent / "conf"
     return inside if inside.is_dir() else Path(__file__).parent.parent / "conf"
+
+
+_PLUGINS = {
+    "joblib": "joblib",
+    "submitit_local": "submitit",
+    "submitit_slurm": "submitit",
+    "ray": "ray-launcher",
+    "optuna": "optuna",
+}
+"""Launchers and sweepers of Hydra, and the extra that each comes with."""
+
+
+@functools.cache
+def set_plugin_defaults() -> None:
+    """Give Hydra's launchers and sweepers, those that are installed, the values of ``conf/hydra/defaults``."""
+    Plugins.instance()  # finds them
+    store, folder = ConfigStore.instance(), conf_dir() / "hydra" / "defaults"
+    for path in folder.glob("*/*.yaml"):
+        group = f"hydra/{path.parent.name}"
+        with contextlib.suppress(ConfigLoadError):
+            plugin = store.load(f"{group}/{path.name}")
+            values = {**OmegaConf.to_container(plugin.node), **OmegaConf.to_container(OmegaConf.load(path))}
+            store.store(path.stem, values, group, provider=plugin.provider)
 
 
 def compose(name: str, overrides: Iterable[str] = (), hydra: bool = False) -> DictConfig:
@@ -77,11 +138,14 @@ def compose(name: str, overrides: Iterable[str] = (), hydra: bool = False) -> Di
         UserError: If an override is no override, or names a group, option or key that does not exist.
     """
     overrides = list(overrides)
+    set_plugin_defaults()
     with initialize_config_dir(str(conf_dir().absolute()), version_base="1.3"):
         try:
             return hydra_compose(name, overrides, return_hydra_config=hydra)
         except MissingConfigException as error:
             wanted = str(error.missing_cfg_file).rpartition("/")[2]
+            if wanted in _PLUGINS:
+                raise UserError(f"{error.missing_cfg_file}: pip install 'physai[{_PLUGINS[wanted]}]'") from None
             raise UserError(f"{error.missing_cfg_file}: no such config{nearest(wanted, error.options or [])}") from None
         except OverrideParseException as error:
             raise UserError(f"'{error.override}' is not an override such as key=value") from None
@@ -138,6 +202,15 @@ def nearest(name: str, options: Iterable[str]) -> str:
     return f"; there are: {', '.join(options)}" if 0 < len(options) <= 12 else ""
 
 
+def not_installed(module: str) -> str:
+    """End of an error message: the module that is missing, and what installs it."""
+    for requirement in importlib.metadata.requires("physai") or []:
+        name, _, extra = requirement.partition("extra == ")
+        if extra and re.split(r"[^\w.-]", name)[0].lower().replace("-", "_") == module.partition(".")[0].lower():
+            return f"'{module}', which is not installed: pip install 'physai[{extra.strip(' )')[1:-1]}]'"
+    return f"'{module}', which is not installed"
+
+
 def _keys(node: DictConfig, prefix: str = "") -> list[str]:
     keys = []
     for key in node:
@@ -178,7 +251,7 @@ def _import(name: str, path: str) -> Any:
             found = importlib.import_module(module)
         except ModuleNotFoundError as error:
             if not f"{module}.".startswith(f"{error.name}."):  # it is there, and needs what is not
-                raise ValueError(f"{path}._target_: {name} needs '{error.name}', which is not installed") from None
+                raise ValueError(f"{path}._target_: {name} needs {not_installed(error.name or module)}") from None
             outer, _, inner = module.rpartition(".")
             module, attribute = outer, f"{inner}.{attribute}"
             continue
@@ -221,7 +294,7 @@ def _parameters(target: Any) -> tuple[dict[str, Any], bool]:
 def _check_value(hint: Any, value: Any, path: str) -> Any:
     """Return the value as its type wants it, so that 1e3 is a count where a count is wanted."""
     try:
-        adapter = TypeAdapter(hint, config=ConfigDict(arbitrary_types_allowed=True))
+        adapter = TypeAdapter(_of_any_length(hint), config=ConfigDict(arbitrary_types_allowed=True))
     except (PydanticSchemaGenerationError, PydanticUndefinedAnnotation, TypeError):
         return value
     try:
@@ -230,6 +303,16 @@ def _check_value(hint: Any, value: Any, path: str) -> Any:
         message = error.errors()[0]["msg"]
         raise ValueError(f"{path}: {message[0].lower()}{message[1:]}, got {value!r}") from None
     return checked if isinstance(checked, int | float | list) else value
+
+
+def _of_any_length(hint: Any) -> Any:
+    """Read ``tuple[float]`` as libraries mean it who give two bounds that type."""
+    arguments = typing.get_args(hint)
+    if typing.get_origin(hint) is tuple and len(arguments) == 1:
+        return tuple[arguments[0], ...]  # type: ignore[valid-type]
+    if typing.get_origin(hint) in (typing.Union, types.UnionType):
+        return typing.Union[tuple(_of_any_length(argument) for argument in arguments)]  # noqa: UP007
+    return hint
 
 
 Target = Annotated[dict[str, Any], AfterValidator(_check_target)]

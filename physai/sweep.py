@@ -1,5 +1,8 @@
 """The end of a sweep: one table of all its runs, one plot, and no failure unseen."""
 
+import os
+import shlex
+import signal
 import sys
 from pathlib import Path
 from typing import Any
@@ -9,17 +12,40 @@ from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 from rich.table import Table
 
+from physai import study
 from physai.errors import UserError
+
+_BEST = 10
 
 
 class SweepReport(Callback):
     """Hydra callback; exits with code 1 if a run of the sweep failed."""
+
+    def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
+        """Start Ray where it is the launcher; by itself it would also take over what this command does on a signal."""
+        if not config.hydra.launcher._target_.endswith(".RayLauncher"):
+            return
+        os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # Ray would report its use to its makers
+        import ray
+
+        arguments = OmegaConf.to_container(config.hydra.launcher.ray.init, resolve=True)
+        if arguments.get("address") == "local":
+            arguments.setdefault("object_store_memory", 80 * 2**20)  # jobs hand nothing over
+        handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+        try:
+            ray.init(**arguments)
+        finally:
+            for number, handler in handlers.items():
+                signal.signal(number, handler)
 
     def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:
         """Report on the runs below the sweep's folder."""
         from physai.plotting import plot_runs, read_summary
 
         folder = Path(config.hydra.sweep.dir)
+        if study.searched(config) is not None:
+            _report_study(folder)
+            return
         runs = sorted((path.parent.parent for path in folder.glob("*/.hydra/overrides.yaml")), key=_number)
         summaries = {run: read_summary(run) for run in runs}
         table = Table(title=f"{folder}", title_justify="left")
@@ -44,6 +70,36 @@ class SweepReport(Callback):
         if failed:
             print(f"error: {len(failed)} of {len(runs)} runs failed", file=sys.stderr)
             sys.exit(1)
+
+
+def _report_study(folder: Path) -> None:
+    """Write ``study.csv`` and ``study.png``, and show the best trials; exit with code 1 if there are none."""
+    from physai.plotting import plot_study
+
+    found = study.load(folder)
+    names = study.short_names(key for trial in found.trials for key in trial.params)
+    study.write_csv(found, folder / "study.csv")
+    over = [(trial.value, trial) for trial in found.trials if trial.value is not None]
+    best = sorted(over, key=lambda one: one[0], reverse=found.direction.name == "MAXIMIZE")
+    table = Table(title=f"{folder}: the best of {len(over)} trials", title_justify="left")
+    for column in ("run", study.objective_name(found), *names.values()):
+        table.add_column(column, justify="left" if column == "run" else "right")
+    for value, trial in best[:_BEST]:
+        table.add_row(str(trial.number), _short(value), *(_short(trial.params.get(key)) for key in names))
+    Console().print(table)
+    for trial in found.trials:
+        if study.failed(folder, trial):
+            print(f"error: {folder / str(trial.number)}: {_reason(folder / str(trial.number))}", file=sys.stderr)
+    if not best:
+        print(f"error: none of {len(found.trials)} trials came to an end", file=sys.stderr)
+        sys.exit(1)
+    plot_study(found, names, folder / "study.png")
+    print(f"All trials: {folder / 'study.csv'}, {folder / 'study.png'}. Train with the best values:")
+    print("  python -m physai.train " + shlex.join(study.command(found, best[0][1])))
+
+
+def _short(value: Any) -> str:
+    return f"{value:.3g}" if isinstance(value, float) else "-" if value is None else str(value)
 
 
 def _number(run: Path) -> tuple[int, str]:

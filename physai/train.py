@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from physai import cli
+from physai import cli, study
 from physai.errors import UserError
 
 if TYPE_CHECKING:
@@ -50,14 +50,19 @@ class _Training:
         self.close()
         self._config = _config(node)
         self._agent = Agent.build(self._config)
-        script(make_deployable(self._agent.actor, self._agent.env))  # what does not script could not be exported
+        script(make_deployable(self._agent.policy(), self._agent.env))  # what does not script could not be exported
 
-    def train(self, node: DictConfig, run_dir: Path) -> None:
+    def __reduce__(self) -> tuple[type, tuple[()]]:
+        return _Training, ()  # a job in another process builds its own
+
+    def train(self, node: DictConfig, run_dir: Path) -> float:
+        """Train; return what a search makes best."""
         config = _config(node)
         if config != self._config:  # the last to be checked is not the first of a sweep
             self.close()
         agent, self._agent = self._agent, None
         _run(config, run_dir, resume=False, agent=agent)
+        return study.objective(run_dir, config.objective)
 
     def close(self) -> None:
         if self._agent is not None:
@@ -99,7 +104,8 @@ def _run(config: "TrainConfig", run_dir: Path, resume: bool, agent: "Agent | Non
     complete = (run_dir / "summary.json").is_file()
     try:
         run_training(config, run_dir, resume, agent)
-        _export(run_dir, complete)
+        if not study.is_running():  # of many trials, few are for a robot
+            _export(run_dir, complete)
     except Interrupted as stopped:
         print(f"\nStopped by {stopped}; everything is saved. Go on with:\n  python -m physai.train resume={run_dir}")
         sys.exit(stopped.exit_code)
@@ -121,4 +127,6 @@ def _export(run_dir: Path, complete: bool) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    from physai import train  # what another process unpickles has a home
+
+    train.main()

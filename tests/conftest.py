@@ -1,4 +1,4 @@
-"""What tests share: one thread, and the two environments that physai comes with."""
+"""What tests share: one thread, and the environments that physai comes with."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -10,7 +10,7 @@ from hypothesis import HealthCheck, settings
 from omegaconf import OmegaConf
 
 from physai.artifact import export_policy
-from physai.config import compose, validate
+from physai.config import compose, conf_dir, validate
 from physai.envs.simulation import EnvConfig
 from physai.training.config import TrainConfig
 from physai.training.run import run_training
@@ -40,12 +40,18 @@ def reacher() -> EnvConfig:
     return _env_config("reacher")
 
 
+def _simulated_envs() -> list[str]:
+    """All files of ``conf/env`` whose robots are simulated; what is added there is tested, too."""
+    names = sorted(path.stem for path in (conf_dir() / "env").glob("*.yaml"))
+    return [name for name in names if _env_config(name).simulated]
+
+
 @pytest.fixture(scope="session")
 def kuka_reacher() -> EnvConfig:
     return _env_config("kuka_reacher")
 
 
-@pytest.fixture(scope="session", params=["reacher", "kuka_reacher"])
+@pytest.fixture(scope="session", params=_simulated_envs())
 def any_env(request: pytest.FixtureRequest) -> EnvConfig:
     """Each environment in turn."""
     return _env_config(request.param)
@@ -54,13 +60,22 @@ def any_env(request: pytest.FixtureRequest) -> EnvConfig:
 @pytest.fixture(scope="session")
 def exported_run(tmp_path_factory: pytest.TempPathFactory, worker_id: str) -> Path:
     """A run of the reacher that reaches most goals, with policy.pt and policy.onnx; not to be written to."""
-    base = tmp_path_factory.getbasetemp()
+    return _run_once(tmp_path_factory, worker_id, "exported_run", "total_frames=120_000")
+
+
+@pytest.fixture(scope="session")
+def recurrent_run(tmp_path_factory: pytest.TempPathFactory, worker_id: str) -> Path:
+    """The same, of a policy that remembers."""
+    return _run_once(tmp_path_factory, worker_id, "recurrent_run", "policy=gru", "total_frames=80_000")
+
+
+def _run_once(factory: pytest.TempPathFactory, worker_id: str, name: str, *overrides: str) -> Path:
+    base = factory.getbasetemp()
     shared = base if worker_id == "master" else base.parent  # of all workers: one of them trains, the others wait
-    run = shared / "exported_run"
-    with FileLock(shared / "exported_run.lock"):
+    run = shared / name
+    with FileLock(shared / f"{name}.lock"):
         if not (run / "policy.onnx").exists():
-            overrides = ["total_frames=120_000", "evaluation.episodes=200"]
-            node = compose("train", overrides)
+            node = compose("train", [*overrides, "evaluation.episodes=200"])
             (run / ".hydra").mkdir(parents=True)
             (run / ".hydra" / "config.yaml").write_text(OmegaConf.to_yaml(node))
             run_training(validate(TrainConfig, node), run)

@@ -24,6 +24,14 @@ def algorithm_of(policy: str) -> str:
     return "algo=ppo"
 
 
+def env_of(robot: str) -> str:
+    """The first environment that has this robot; the reacher's takes others."""
+    for name in choices("env"):
+        if compose("train", [f"env={name}"], hydra=True).hydra.runtime.choices["robot@env.robot"] == robot:
+            return f"env={name}"
+    return "env=reacher"
+
+
 def small(*overrides: str) -> TrainConfig:
     """A config of few robots and small batches."""
     minibatch = ["algo.minibatch_size=32"] if "minibatch_size" in compose("train", overrides).algo else []
@@ -34,6 +42,8 @@ def small(*overrides: str) -> TrainConfig:
     "overrides",
     [[f"{group}={name}"] for group in ("env", "algo", "randomization", "logger") for name in choices(group)]
     + [[algorithm_of(name), f"policy={name}"] for name in choices("policy")]
+    + [[env_of(name), f"robot@env.robot={name}"] for name in choices("robot")]
+    + [[f"task@env.task={name}"] for name in choices("task")]
     + [[f"experiment={name}"] for name in choices("experiment")],
     ids=lambda overrides: overrides[-1],
 )
@@ -72,7 +82,7 @@ def test_sb3_defaults_are_the_well_known_numbers():
 
 def test_a_privileged_critic_sees_the_physics_that_the_actor_does_not():
     overrides = ["policy.critic.in_keys=[normalized_observation,features,physics_parameters]"]
-    agent = Agent.build(validate(TrainConfig, compose("train", [*SMALL, *overrides])))
+    agent = Agent.build(small(*overrides))
     batch = next(iter(agent.collector))
     assert agent.critic.network[0].in_features == 8 + 12 + len(agent.env.simulation.layout.labels)
     agent.algorithm.update(batch)

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from typing import Any, Protocol
 
+import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 
@@ -16,12 +17,17 @@ class Networks:
     Attributes:
         actor: The policy; for losses that draw from it, ``dist_sample_keys`` and ``log_prob_keys`` tell what was drawn.
         critic: Judges states, or actions in states.
-        normalizer: Makes ``normalized_observation`` of an ``observation``, with the statistics of now.
+        normalizer: Makes ``normalized_observation`` of an ``observation``, with the statistics of now; on the CPU.
     """
 
     actor: TensorDictModuleBase
     critic: TensorDictModuleBase
     normalizer: Normalizer
+
+    @property
+    def device(self) -> torch.device:
+        """Where actor and critic are, and where learning takes place."""
+        return next(self.critic.parameters()).device
 
 
 class Algorithm(Protocol):
@@ -34,7 +40,7 @@ class Algorithm(Protocol):
     warmup_frames: int
 
     def update(self, batch: TensorDictBase) -> dict[str, float]:
-        """Learn from a batch of frames [N, T]; return what there is to plot, the same keys every time.
+        """Learn from a batch of frames [N, T] on the CPU; return what there is to plot, the same keys every time.
 
         Raises:
             NonFiniteError: If a loss or gradient is not finite; the step is not taken.

@@ -8,9 +8,9 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LRScheduler
-from torchrl.data import TensorDictReplayBuffer
-from torchrl.data.replay_buffers import PrioritizedSampler
-from torchrl.objectives import TargetNetUpdater
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.data.replay_buffers import PrioritizedSampler, RandomSampler
+from torchrl.objectives import TargetNetUpdater, TD3Loss
 from torchrl.objectives.utils import ValueEstimators
 
 from physai.algorithms.descent import Descent, check_ranges
@@ -19,6 +19,7 @@ from physai.config import Count, NonNegativeFloat, PositiveFloat
 from physai.errors import UserError
 
 _RAW, _NORMALIZED = "observation", "normalized_observation"
+_MADE_LATER = {("priority_weight",), ("next", "action")}  # by the buffer and by the loss
 
 
 class OffPolicy:
@@ -32,7 +33,8 @@ class OffPolicy:
         frames_per_batch: Size of the batches to come.
         loss: Makes the loss module from the actor and the critic; all its ``loss_*`` outputs are summed.
         gamma: Discount factor.
-        buffer: Replay buffer; its ``batch_size`` is the minibatch of a gradient step.
+        buffer: Replay buffer on LazyTensorStorage or LazyMemmapStorage, with RandomSampler or PrioritizedSampler.
+        minibatch_size: Samples of a gradient step.
         optimizer: Makes the optimizer from the parameters.
         scheduler: Makes the learning-rate schedule from the optimizer; it steps once a batch. None keeps the rate.
         target: Makes what lets the target networks follow, from the loss module.
@@ -49,6 +51,7 @@ class OffPolicy:
         loss: Callable[..., Any],
         gamma: NonNegativeFloat,
         buffer: TensorDictReplayBuffer,
+        minibatch_size: Count,
         optimizer: Callable[..., Optimizer],
         scheduler: Callable[..., LRScheduler] | None,
         target: Callable[..., TargetNetUpdater],
@@ -57,6 +60,8 @@ class OffPolicy:
         actor_every: Count,
         max_grad_norm: PositiveFloat,
     ) -> None:
+        if getattr(networks.actor, "memory_size", 0):
+            raise UserError("policy.actor: this algorithm learns from single frames: the actor must not remember any")
         if "state_action_value" not in networks.critic.out_keys:
             raise UserError("policy.critic.in_keys: this algorithm's critic judges actions: it must see 'action'")
         if frames_per_batch % frames_per_update:
@@ -64,27 +69,35 @@ class OffPolicy:
                 f"algo.frames_per_update ({frames_per_update}) must divide "
                 f"collector.frames_per_batch ({frames_per_batch})"
             )
-        if buffer.batch_size is None or buffer.storage.max_size < max(frames_per_batch, buffer.batch_size):
-            raise UserError(
-                f"algo.buffer.storage.max_size: {buffer.storage.max_size} frames are fewer than a batch "
-                f"({frames_per_batch}) or a minibatch ({buffer.batch_size})"
-            )
-        self.loss = loss(networks.actor, networks.critic)
+        _check_buffer(buffer, frames_per_batch)
+        try:
+            self.loss = loss(networks.actor, networks.critic)
+        except ValueError as error:
+            raise UserError(f"algo.loss: {error}") from None
+        except (AttributeError, IndexError):  # no get_dist, or no log_prob_keys
+            name = type(networks.actor).__name__
+            raise UserError(f"policy.actor: this loss draws from a distribution, and {name} has none") from None
+        judged = {_path(key) for key in networks.critic.in_keys}
+        if isinstance(self.loss, TD3Loss) and (unseen := judged - {("action",), *map(_path, networks.actor.in_keys)}):
+            raise UserError(f"policy.critic.in_keys: in TD3Loss it sees what the actor sees, not '{min(unseen)[0]}'")
         self.loss.make_value_estimator(ValueEstimators.TD0, gamma=gamma)
         check_ranges("algo", self.loss.value_estimator)
         self._target = target(self.loss)
         self.descent = Descent(self.loss, optimizer, scheduler, max_grad_norm)
         self.warmup_frames = warmup_frames
         self.buffer = buffer
+        self.minibatch_size = minibatch_size
         self._generator = torch.Generator()
         self._generator.manual_seed(int(torch.randint(2**62, ())))
         buffer.set_rng(self._generator)
         self._seen = 0  # frames
+        self._steps = 0
         self._updates = frames_per_batch // frames_per_update
         self._actor_every = actor_every
-        self._normalizer = networks.normalizer
-        stored = {tuple(_RAW if part == _NORMALIZED else part for part in _path(key)) for key in self.loss.in_keys}
-        self._keys = [*sorted(stored | {("action",), (_RAW,), ("next", _RAW)} - {("priority_weight",)})]
+        self._normalizer, self._device = networks.normalizer, networks.device
+        needed = {_path(key) for key in self.loss.in_keys} | judged | {("next", *key) for key in judged}
+        stored = {tuple(_RAW if part == _NORMALIZED else part for part in path) for path in needed}
+        self._keys = sorted((stored | {("action",), (_RAW,), ("next", _RAW)}) - _MADE_LATER)
 
     def update(self, batch: TensorDictBase) -> dict[str, float]:
         """Remember a batch of frames [N, T] and learn from all that is remembered; return means over the steps.
@@ -97,18 +110,20 @@ class OffPolicy:
         self.buffer.extend(batch.select(*self._keys, strict=False).reshape(-1))
         self._seen += batch.numel()
         learning = self._seen > self.warmup_frames
-        updates, size = (self._updates if learning else 1), self.buffer.batch_size
+        updates, size = (self._updates if learning else 1), self.minibatch_size
         # One draw for all steps, and slices of it: drawing each minibatch by itself takes longer than learning from it.
         drawn = self.buffer.sample(updates * size)
         for frames in (drawn, drawn.get("next")):
             frames.set(_NORMALIZED, self._normalizer(frames.get(_RAW)))
+        drawn = drawn.to(self._device)
         results, priorities = [], []
         for step in range(updates):
             minibatch = drawn[step * size : (step + 1) * size]
             losses = self.loss(minibatch)
-            figures = losses.select(*(key for key in losses.keys() if losses.get(key).ndim == 0)).detach()
+            figures = losses.select(*(key for key, value in losses.items() if value.ndim == 0)).detach()
             if learning:
-                leave_out = "loss_actor" if (step + 1) % self._actor_every else ""
+                self._steps += 1
+                leave_out = "loss_actor" if self._steps % self._actor_every else ""
                 figures.set("grad_norm", self.descent.step(losses, minibatch, leave_out))
                 self._target.step()
             else:
@@ -136,6 +151,7 @@ class OffPolicy:
             "frames": {".".join(key): frames.get(key).clone() for key in self._keys} if held else {},
             "cursor": self.buffer.writer._cursor,
             "seen": self._seen,
+            "steps": self._steps,
             "priorities": priorities,
             "generator": self._generator.get_state(),
         }
@@ -155,10 +171,30 @@ class OffPolicy:
             leaves, sampler._max_priority = state["priorities"]
             sampler._sum_tree[torch.arange(len(leaves))] = leaves
             sampler._min_tree[torch.arange(len(leaves))] = leaves
-        self._seen = state["seen"]
+        self._seen, self._steps = state["seen"], state["steps"]
         self._generator.set_state(state["generator"])
+
+
+def _check_buffer(buffer: TensorDictReplayBuffer, frames_per_batch: int) -> None:
+    storage, sampler = buffer.storage, buffer.sampler
+    if not isinstance(storage, LazyTensorStorage) or type(sampler) not in (RandomSampler, PrioritizedSampler):
+        raise UserError(
+            "algo.buffer: storage must be a LazyTensorStorage or LazyMemmapStorage, and sampler a RandomSampler or "
+            f"PrioritizedSampler, got {type(storage).__name__} and {type(sampler).__name__}"
+        )
+    if buffer.batch_size is not None:
+        raise UserError("algo.buffer.batch_size: leave it out; minibatches are algo.minibatch_size")
+    if storage.max_size < frames_per_batch:
+        raise UserError(
+            f"algo.buffer.storage.max_size: a batch, collector.frames_per_batch={frames_per_batch}, "
+            f"does not fit into {storage.max_size}"
+        )
+    if isinstance(sampler, PrioritizedSampler) and sampler.max_size < storage.max_size:
+        raise UserError(
+            f"algo.buffer.sampler.max_capacity ({sampler.max_size}) must be "
+            f"algo.buffer.storage.max_size ({storage.max_size})"
+        )
 
 
 def _path(key: str | tuple[str, ...]) -> tuple[str, ...]:
     return (key,) if isinstance(key, str) else tuple(key)
-

@@ -28,7 +28,8 @@ class OnPolicy:
             summed.
         advantage: Makes the advantage module from ``value_network``.
         buffer: Replay buffer that hands out a batch in another order for each epoch.
-        minibatch_size: Samples of a gradient step; what is left over at the end of an epoch is not used.
+        minibatch_size: Samples of a gradient step; what is left over at the end of an epoch is not used. An actor that
+            remembers learns from whole sequences: as many as have so many samples, at least one.
         optimizer: Makes the optimizer from the parameters.
         scheduler: Makes the learning-rate schedule from the optimizer; it steps once a batch.
         epochs: Passes over each batch.
@@ -69,6 +70,8 @@ class OnPolicy:
         self.descent = Descent(self.loss, optimizer, scheduler, max_grad_norm)
         self.buffer = buffer
         self.minibatch_size = minibatch_size
+        self._device = networks.device
+        self._in_sequences = getattr(networks.actor, "memory_size", 0) > 0
         # What comes after a frame has done its part once there are advantages; each key is gathered in each epoch.
         now = [key for key in self.loss.in_keys if not (isinstance(key, tuple) and key[0] == "next")]
         self._judged = self.advantage.tensor_keys.value, self.advantage.tensor_keys.value_target
@@ -81,13 +84,17 @@ class OnPolicy:
         Raises:
             NonFiniteError: If a loss or gradient is not finite; the step is not taken.
         """
+        if self._device.type != "cpu":
+            batch = batch.to(self._device)
         with torch.no_grad():
             self.advantage(batch)
-        self.buffer.empty()
-        self.buffer.extend(batch.select(*self._keys, strict=False).reshape(-1))
+        frames = batch.select(*self._keys, strict=False)
+        if not self._in_sequences:
+            self.buffer.empty()
+            self.buffer.extend(frames.reshape(-1))
         results: list[TensorDictBase] = []
         for _ in range(self.epochs):
-            for minibatch in self._minibatches():
+            for minibatch in self._sequences(frames) if self._in_sequences else self._minibatches():
                 losses = self.loss(minibatch)
                 results.append(losses.set("grad_norm", self.descent.step(losses, minibatch)))
         with torch.no_grad():
@@ -95,6 +102,12 @@ class OnPolicy:
             metrics = {key: float(value) for key, value in means.items()}
             metrics["explained_variance"] = _explained_variance(*(batch.get(key) for key in self._judged))
         return metrics | {"lr": self.descent.end_batch()}
+
+    def _sequences(self, frames: TensorDictBase) -> Iterator[TensorDictBase]:
+        """Whole rows of frames [N, T], in another order for each epoch."""
+        robots, steps = frames.shape
+        order = torch.randperm(robots).split(max(1, self.minibatch_size // steps))
+        return (frames[rows] for rows in order if len(rows) == len(order[0]))
 
     def _minibatches(self) -> Iterator[TensorDictBase]:
         # One draw an epoch, and slices of it: drawing each minibatch from the buffer takes eight times as long.

@@ -12,15 +12,14 @@ from torch import Tensor
 import physai
 from physai.artifact.states import States
 from physai.deploy.metadata import (
-    DISTANCE,
     FORMAT,
     FORMAT_VERSION,
     MEMORY,
     NEW_MEMORY,
     OUTPUT,
     UNITS,
-    inputs,
-    outputs,
+    input_keys,
+    output_keys,
 )
 from physai.envs.simulation import Simulation
 
@@ -40,8 +39,8 @@ def describe_robot(simulation: Simulation, memory_size: int = 0) -> dict[str, An
             "urdf_sha256": hashlib.sha256(spec.urdf.read_bytes()).hexdigest(),
         },
         "units": UNITS,
-        "inputs": {key: ["N", sizes[key]] for key in inputs(memory_size)},
-        "outputs": {key: ["N", sizes[key]] for key in outputs(memory_size)},
+        "inputs": {key: ["N", sizes[key]] for key in input_keys(memory_size)},
+        "outputs": {key: ["N", sizes[key]] for key in output_keys(memory_size)},
         "limits": {
             "position": [[x if np.isfinite(x) else None for x in pair] for pair in spec.position_limit.tolist()],
             "velocity": spec.velocity_limit.tolist(),

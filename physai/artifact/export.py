@@ -13,7 +13,7 @@ from physai.artifact.module import make_deployable, save, script
 from physai.artifact.states import States, extreme_states, roll_out
 from physai.deploy import Metadata, PolicyError, load_policy
 from physai.deploy.archive import content_sha256
-from physai.deploy.metadata import INPUTS, metadata_sha256
+from physai.deploy.metadata import metadata_sha256
 from physai.deploy.policy import load_module
 from physai.seeding import derive
 from physai.training.checkpoint import write
@@ -53,18 +53,20 @@ def export_policy(
     actor, env = trained.deploy(_ROBOTS, SEED)
     try:
         policy = make_deployable(actor, env)
-        rollout, extremes = roll_out(actor, env), extreme_states(env)
-        states = States(*(torch.cat([rollout.get(key), value]) for key, value in zip(INPUTS, extremes, strict=True)))
+        rollout, extremes = roll_out(actor, env), extreme_states(env, policy.memory_size)
+        work = States(*(rollout.get(key) for key in policy.in_keys))
+        states = States(*map(torch.cat, zip(work, extremes, strict=True)))
         tried = f"{len(rollout):,} states of its work, {len(extremes.goal):,} extremes"
         gate.check_against_env(policy, actor, env, rollout, states)
         report("the artifact is the policy", f"{tried}: equal to the last bit")
 
         scripted = script(policy)
         content = save(scripted)
+        loaded = load_module(content, policy.in_keys)
         expected = gate.answers(policy, states)
         for stage, found in (
             ("TorchScript is not the artifact", gate.answers(scripted, states)),
-            ("the loaded file is not the artifact", gate.answers(load_module(content), states)),
+            ("the loaded file is not the artifact", gate.answers(loaded, states)),
             ("a fresh process disagrees", gate.ask_fresh_process(content, states)),
         ):
             gate.compare_answers(stage, found, expected, states)
@@ -75,16 +77,24 @@ def export_policy(
             worst = gate.check_onnx(onnx.Runtime(converted), expected, states)
             report("ONNX in ONNX Runtime", f"within {worst:.1e} rad/s")
 
+        if policy.memory_size:
+            forms: dict[str, tuple[gate.Function, float]] = {"the artifact": (policy, 0.0), "the file": (loaded, 0.0)}
+            if converted is not None:
+                forms["ONNX Runtime"] = (onnx.Runtime(converted), gate.ONNX_TOLERANCE)
+            worst = gate.check_recurrence(forms, gate.acting(actor, env), work)
+            others = f", ONNX within {worst:.1e}" if converted is not None else ""
+            report("remembers as the policy does", f"over {len(rollout):,} steps: to the last bit{others}")
+
         driven = gate.check_drive(content, actor, env, episodes, SEED)
         report(f"drives {episodes:,} episodes", f"reaches {driven.success_rate:.1%} of the goals, as the policy does")
 
         described = {
             **describe.describe_origin(git_commit()),
-            **describe.describe_robot(env.simulation),
+            **describe.describe_robot(env.simulation, policy.memory_size),
             "checkpoint": {"which": which, "frames": trained.frames},
             "evaluation": {**driven.summary(), "episodes": episodes, "randomization": trained.randomization.name},
             "config": trained.config.model_dump(mode="json"),
-            "golden": describe.golden_pairs(states, expected, GOLDEN_PAIRS),
+            "golden": describe.golden_pairs(states, gate.split(expected, states), GOLDEN_PAIRS),
             "content_sha256": content_sha256(content),
         }
         described["metadata_sha256"] = metadata_sha256(described)

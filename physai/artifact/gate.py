@@ -13,11 +13,12 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
+from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from physai.artifact import fresh_process
-from physai.artifact.module import VIEWS, DeployablePolicy, as_tuple
+from physai.artifact.module import VIEWS, Deployable, as_tuple
 from physai.artifact.states import States
-from physai.deploy.metadata import DISTANCE, NEW_MEMORY, OUTPUT, Metadata, inputs
+from physai.deploy.metadata import DISTANCE, NEW_MEMORY, OUTPUT, Metadata, input_keys, output_keys
 from physai.deploy.policy import load_module
 from physai.envs.make import TransformedRobotEnv
 from physai.envs.simulation import Simulation
@@ -79,27 +80,30 @@ def answers(policy: Any, states: States) -> Tensor:
     return one_by_one(lambda *row: (*as_tuple(policy(*row)), policy.distance(row[0], row[2])), states)
 
 
-def split(answers: Tensor, states: States) -> dict[str, Tensor]:
-    """Take ``answers`` to S states apart, by name."""
+def split(values: Tensor, states: States) -> dict[str, Tensor]:
+    """Take outputs or answers [S, ...] to S states apart, by name."""
     joints = states.joint_position.shape[1]
-    parts = {OUTPUT: answers[:, :joints], NEW_MEMORY: answers[:, joints:-1], DISTANCE: answers[:, -1:]}
+    end = joints + states.memory_size
+    parts = {OUTPUT: values[:, :joints], NEW_MEMORY: values[:, joints:end], DISTANCE: values[:, end:]}
     return {key: part for key, part in parts.items() if part.shape[1]}
 
 
-def compare_answers(stage: str, found: Tensor, expected: Tensor, states: States) -> None:
-    """Compare answers to the last bit.
+def compare_answers(stage: str, found: Tensor, expected: Tensor, states: States, tolerance: float = 0.0) -> float:
+    """Compare outputs or answers, by default to the last bit; return the largest difference.
 
     Raises:
         GateError: If a command, a memory or a distance differs.
     """
     given = split(found, states)
-    for key, part in split(expected, states).items():
-        compare(stage, key, given.get(key, found[:, :0]), part, states)
+    return max(
+        compare(stage, key, given.get(key, found[:, :0]), part, states, tolerance)
+        for key, part in split(expected, states).items()
+    )
 
 
 @torch.no_grad()
 def check_against_env(
-    policy: DeployablePolicy,
+    policy: Deployable,
     actor: TensorDictModuleBase,
     env: TransformedRobotEnv,
     rollout: TensorDictBase,
@@ -163,7 +167,7 @@ def acting(actor: TensorDictModuleBase, env: TransformedRobotEnv) -> Function:
         with set_exploration_type(ExplorationType.DETERMINISTIC):
             acted = actor(see(*inputs))
         command = acted.get("action").clamp(-1.0, 1.0) * limit
-        return (command, acted.get(NEW_MEMORY)) if len(inputs) > len(States(*inputs).sensed) else (command,)
+        return (command, acted.get(NEW_MEMORY)) if States(*inputs).memory_size else (command,)
 
     return act
 
@@ -174,15 +178,15 @@ def unroll(function: Function, states: States) -> Tensor:
     Returns:
         [S, n + H], commands and memories.
     """
-    memory, steps = torch.zeros_like(states.memory[:1]), []
+    memory, steps = torch.zeros(1, states.memory_size), []
     for row in states.sensed.rows():
         command, memory = function(*row, memory)
         steps.append(torch.cat([command, memory], dim=1))
     return torch.cat(steps)
 
 
-def check_recurrence(forms: dict[str, tuple[Function, float]], actor: Function, states: States) -> None:
-    """Forms of a policy that remembers, each with its own memory, over S steps.
+def check_recurrence(forms: dict[str, tuple[Function, float]], actor: Function, states: States) -> float:
+    """Let forms of a policy remember S steps, each by itself, and return the largest difference to the trained policy.
 
     Args:
         forms: By name, with the largest difference allowed.
@@ -192,11 +196,11 @@ def check_recurrence(forms: dict[str, tuple[Function, float]], actor: Function, 
     Raises:
         GateError: If a command or a memory differs.
     """
-    expected, joints = unroll(actor, states), states.joint_position.shape[1]
-    for name, (form, tolerance) in forms.items():
-        found, stage = unroll(form, states), f"{name} remembers otherwise"
-        compare(stage, OUTPUT, found[:, :joints], expected[:, :joints], states, tolerance)
-        compare(stage, NEW_MEMORY, found[:, joints:], expected[:, joints:], states, tolerance)
+    expected = unroll(actor, states)
+    return max(
+        compare_answers(f"{name} remembers otherwise", unroll(form, states), expected, states, tolerance)
+        for name, (form, tolerance) in forms.items()
+    )
 
 
 def ask_fresh_process(content: bytes, states: States) -> Tensor:
@@ -208,7 +212,8 @@ def ask_fresh_process(content: bytes, states: States) -> Tensor:
     with tempfile.TemporaryDirectory() as folder:
         policy, inputs, outputs = (Path(folder) / name for name in ("policy.pt", "inputs.npz", "outputs.npy"))
         policy.write_bytes(content)
-        np.savez(inputs, **{key: value.numpy() for key, value in states.named().items()})
+        columns: dict[str, Any] = {key: value.numpy() for key, value in states.named().items()}
+        np.savez(inputs, **columns)
         command = [sys.executable, "-I", fresh_process.__file__, str(policy), str(inputs), str(outputs)]
         try:
             process = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE)
@@ -264,17 +269,12 @@ def check_onnx(runtime: Function, expected: Tensor, states: States) -> float:
     Raises:
         GateError: If it is larger than ``ONNX_TOLERANCE``.
     """
-    worst, joints = 0.0, states.joint_position.shape[1]
-    for how, found in (
-        ("one by one", one_by_one(runtime, states)),
-        ("in a batch", torch.cat(as_tuple(runtime(*states)), dim=1)),
-    ):
-        for key, part in ((OUTPUT, slice(0, joints)), (NEW_MEMORY, slice(joints, -1))):
-            if expected[:, part].shape[1]:
-                given = found[:, part.start : None if part.stop == -1 else part.stop]
-                stage = f"ONNX Runtime disagrees ({how})"
-                worst = max(worst, compare(stage, key, given, expected[:, part], states, ONNX_TOLERANCE))
-    return worst
+    stage, outputs = "ONNX Runtime disagrees", expected[:, :-1]
+    in_a_batch = torch.cat(as_tuple(runtime(*states)), dim=1)
+    return max(
+        compare_answers(f"{stage} (one by one)", one_by_one(runtime, states), outputs, states, ONNX_TOLERANCE),
+        compare_answers(f"{stage} (in a batch)", in_a_batch, outputs, states, ONNX_TOLERANCE),
+    )
 
 
 def check_drive(
@@ -285,7 +285,9 @@ def check_drive(
     Raises:
         GateError: If its success rate is not that of the actor on the same goals.
     """
-    driven = evaluate(_Driver(content, env.simulation.config.max_velocity), env, episodes, seed)
+    driven = evaluate(
+        _Driver(content, getattr(actor, "memory_size", 0), env.simulation.config.max_velocity), env, episodes, seed
+    )
     judged = evaluate(actor, env, episodes, seed)
     if abs(driven.success_rate - judged.success_rate) > SUCCESS_TOLERANCE:
         raise GateError(
@@ -296,16 +298,14 @@ def check_drive(
 
 
 class _Driver(TensorDictModuleBase):
-    """A policy file in the place of the actor: sees only what a robot senses."""
+    """A policy file in the place of the actor: sees only what a robot senses, and what it remembers."""
 
-    in_keys = INPUTS
-    out_keys = ("action",)
-
-    def __init__(self, content: bytes, max_velocity: float) -> None:
+    def __init__(self, content: bytes, memory_size: int, max_velocity: float) -> None:
         super().__init__()
-        self.module = load_module(content)
+        self.in_keys, self.out_keys = input_keys(memory_size), ("action", NEW_MEMORY)[: len(output_keys(memory_size))]
+        self.module = load_module(content, self.in_keys)
         self.max_velocity = max_velocity
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        command = self.module(*(tensordict.get(key) for key in self.in_keys))
-        return tensordict.set("action", command / self.max_velocity)
+        command, *memory = as_tuple(self.module(*(tensordict.get(key) for key in self.in_keys)))
+        return tensordict.update(dict(zip(self.out_keys, (command / self.max_velocity, *memory), strict=True)))

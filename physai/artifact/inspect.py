@@ -89,4 +89,6 @@ def _joints(metadata: Metadata) -> Table:
 
 
 def _shapes(shapes: dict[str, list[Any]], units: dict[str, str]) -> str:
-    return ", ".join(f"{key} [{', '.join(map(str, shape))}] {units.get(key, '')}".rstrip() for key, shape in shapes.items())
+    return ", ".join(
+        f"{key} [{', '.join(map(str, shape))}] {units.get(key, '')}".rstrip() for key, shape in shapes.items()
+    )

@@ -11,14 +11,14 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
 from physai.deploy.archive import METADATA
-from physai.deploy.metadata import INPUTS, OUTPUT, inputs, outputs
+from physai.deploy.metadata import INPUTS, OUTPUT, input_keys, output_keys
 from physai.envs.make import TransformedRobotEnv
 from physai.errors import UserError
 
 VIEWS = ("observation", "normalized_observation", "features")  # what a policy can see on a robot
 
 
-class DeployablePolicy(TensorDictModuleBase):
+class Deployable(TensorDictModuleBase):
     """Kinematics, observation, frozen normalization, network, squashing and scaling.
 
     It shares no memory with what it was made from, and needs no gradients.
@@ -26,7 +26,7 @@ class DeployablePolicy(TensorDictModuleBase):
     Args:
         observation: The task's observation module.
         normalizer: Normalizes an observation.
-        network: Maps what it sees, side by side, to actions in [-1, 1].
+        network: Acts on what it sees, side by side.
         in_keys: What the network sees, of ``VIEWS``, in order.
         command_limit: What an action of 1 means, rad/s, [n].
 
@@ -63,11 +63,6 @@ class DeployablePolicy(TensorDictModuleBase):
         self.requires_grad_(False)
         self.eval()
 
-    def forward(self, joint_position: Tensor, joint_velocity: Tensor, goal: Tensor) -> Tensor:
-        """Map positions [N, n] rad, velocities [N, n] rad/s and goals [N, 2] m to velocity commands [N, n], rad/s."""
-        views = self.views(joint_position, joint_velocity, goal)
-        return self.network(torch.cat([views[i] for i in self.seen], dim=1)) * self.command_limit
-
     def __call__(self, *inputs: Any) -> Any:
         """Act on tensors; or on a TensorDict with ``in_keys``, as other TensorDictModules do."""
         if len(inputs) != 1:
@@ -88,35 +83,31 @@ class DeployablePolicy(TensorDictModuleBase):
         return distance
 
 
-class RecurrentDeployablePolicy(DeployablePolicy):
-    """A policy that remembers; its memory is an input and an output, and zeros where an episode begins.
+class DeployablePolicy(Deployable):
+    """A policy whose ``network`` maps what it sees to actions in [-1, 1]."""
+
+    def forward(self, joint_position: Tensor, joint_velocity: Tensor, goal: Tensor) -> Tensor:
+        """Map positions [N, n] rad, velocities [N, n] rad/s and goals [N, 2] m to velocity commands [N, n], rad/s."""
+        views = self.views(joint_position, joint_velocity, goal)
+        return self.network(torch.cat([views[i] for i in self.seen], dim=1)) * self.command_limit
+
+
+class RecurrentDeployablePolicy(Deployable):
+    """A policy that remembers; its ``network`` maps what it sees and a memory to actions in [-1, 1] and the new memory.
+
+    The memory is an input and an output: zeros where an episode begins, and the caller's to keep.
 
     Args:
-        observation: The task's observation module.
-        normalizer: Normalizes an observation.
-        network: Maps what it sees, side by side, and a memory to actions in [-1, 1] and the new memory.
-        in_keys: What the network sees, of ``VIEWS``, in order.
-        command_limit: What an action of 1 means, rad/s, [n].
         memory_size: H.
-
-    Raises:
-        UserError: If the policy sees what no robot can tell it.
+        parts: As of :class:`Deployable`.
     """
 
-    def __init__(
-        self,
-        observation: nn.Module,
-        normalizer: nn.Module,
-        network: nn.Module,
-        in_keys: list[str],
-        command_limit: Tensor,
-        memory_size: int,
-    ) -> None:
-        super().__init__(observation, normalizer, network, in_keys, command_limit)
+    def __init__(self, memory_size: int, *parts: Any) -> None:
+        super().__init__(*parts)
         self.memory_size = memory_size
-        self.in_keys, self.out_keys = list(inputs(memory_size)), list(outputs(memory_size))
+        self.in_keys, self.out_keys = list(input_keys(memory_size)), list(output_keys(memory_size))
 
-    def forward(  # type: ignore[override]  # TorchScript knows no optional outputs
+    def forward(
         self, joint_position: Tensor, joint_velocity: Tensor, goal: Tensor, memory: Tensor
     ) -> tuple[Tensor, Tensor]:
         """Map what the robot senses, as without memory, and a memory [N, H] to commands [N, n] and the new memory."""
@@ -130,7 +121,7 @@ def as_tuple(answer: Tensor | tuple[Tensor, ...]) -> tuple[Tensor, ...]:
     return answer if isinstance(answer, tuple) else (answer,)
 
 
-def make_deployable(actor: TensorDictModuleBase, env: TransformedRobotEnv) -> DeployablePolicy:
+def make_deployable(actor: TensorDictModuleBase, env: TransformedRobotEnv) -> Deployable:
     """Put a trained actor and the env that it was trained in together.
 
     Raises:
@@ -141,11 +132,11 @@ def make_deployable(actor: TensorDictModuleBase, env: TransformedRobotEnv) -> De
     views = env.simulation.observation, env.normalization.normalizer
     size = getattr(actor, "memory_size", 0)
     if size:
-        return RecurrentDeployablePolicy(*views, actor.deterministic(), actor.seen_keys, limit, size)
+        return RecurrentDeployablePolicy(size, *views, actor.deterministic(), actor.seen_keys, limit)
     return DeployablePolicy(*views, actor.deterministic(), actor.in_keys, limit)
 
 
-def script(policy: DeployablePolicy) -> torch.jit.ScriptModule:
+def script(policy: Deployable) -> torch.jit.ScriptModule:
     """Compile to TorchScript.
 
     Raises:

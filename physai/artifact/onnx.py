@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from physai.artifact.module import DeployablePolicy
+from physai.artifact.module import Deployable
 from physai.artifact.states import States
 from physai.deploy.archive import METADATA
 from physai.errors import UserError
@@ -25,7 +25,7 @@ def missing() -> list[str]:
     return [name for name in PACKAGES if importlib.util.find_spec(name) is None]
 
 
-def convert(policy: DeployablePolicy, states: States) -> bytes:
+def convert(policy: Deployable, states: States) -> bytes:
     """Convert a policy, for any number of rows.
 
     Args:
@@ -105,7 +105,7 @@ class Runtime:
             raise UserError(f"ONNX Runtime refuses the file ({' '.join(str(error).split())[:160]})") from None
 
     def __call__(self, *inputs: Tensor) -> Tensor | tuple[Tensor, ...]:
-        """Map a policy's inputs to its outputs, as its module does: positions [N, n] rad, velocities [N, n] rad/s, ..."""
+        """Map a policy's inputs, [N, ...] each, to its outputs, as its module does."""
         names = [node.name for node in self._session.get_inputs()]
         given = {name: value.numpy() for name, value in zip(names, inputs, strict=True)}
         outputs = tuple(map(torch.from_numpy, self._session.run(None, given)))

@@ -47,6 +47,11 @@ class States(tuple[Tensor, ...]):
         return self[2]
 
     @property
+    def memory_size(self) -> int:
+        """H, or 0."""
+        return sum(value.shape[1] for value in self[len(INPUTS) :])
+
+    @property
     def sensed(self) -> "States":
         """The same without memory."""
         return States(*self[: len(INPUTS)])
@@ -79,7 +84,7 @@ def roll_out(actor: TensorDictModuleBase, env: TransformedRobotEnv) -> TensorDic
 
 
 def extreme_states(env: TransformedRobotEnv, memory_size: int = 0) -> States:
-    """Corners of the joint limits, far goals and huge velocities, each with each; and full memories, if there are any."""
+    """Corners of the joint limits, far goals and huge velocities, each with each; memories from empty to full."""
     spec, (_, outer) = env.simulation.spec, env.simulation.task.goal_region
     limits = torch.from_numpy(spec.position_limit).clamp(-_TURNS, _TURNS)
     ends = torch.stack([limits[:, 0], torch.zeros(len(limits)), limits[:, 1]])  # [3, n]

@@ -18,7 +18,7 @@ PARTS = {
     "ros": "period and answers of the ROS 2 node, beside a bare one's",
     "gym": "the Gymnasium envs, against one written by hand and Stable-Baselines3's vector env",
     "startup": "how soon commands answer, how soon the first frame is there, and how long a thousand episodes take",
-    "collection": "collection by one process and by two, against a bare PyBullet loop",
+    "collection": "collection by one process and by two, against a bare PyBullet loop; and by each collector",
     "update": "learning from a batch, against PPO written by hand",
     "training": "time to 99 percent of unseen goals, against Stable-Baselines3 PPO",
     "growth": "time and memory of training against frames and robots",
@@ -28,6 +28,7 @@ NEEDS = {  # the extra that a part needs, and its modules
     "ros": ("ros", ["rclpy"]),
     "gym": ("bench", ["stable_baselines3"]),
     "training": ("bench", ["stable_baselines3"]),
+    "collection": ("ray", ["ray"]),
 }
 
 

@@ -8,10 +8,11 @@ from functools import partial
 import numpy as np
 import pybullet as bullet
 import torch
+from rich.console import Group
 from rich.table import Table
 
 from physai.bench.timing import median_speeds, reacher, table
-from physai.collectors import CollectorConfig, make_collector
+from physai.collectors import make_collector
 from physai.envs.make import make_env
 from physai.physics.pybullet import ROBOTS_PER_WORLD
 from physai.robots import RobotSpec
@@ -19,14 +20,17 @@ from physai.training.agent import make_actor
 from physai.training.config import TrainConfig
 
 ROBOTS = (1, 16, 64, 128, 256, 512, 1024)
+COLLECTORS = ("single", "multi_sync", "multi_async", "ray")
 ROUNDS = 7
 STEPS_PER_ROUND = 112  # longer than most episodes, so that every round pays for its resets
 SMALL = 32  # fewer robots hand over one batch a round: nobody would collect batches of a few frames
 
 
-def run(options: Namespace) -> Table:
+def run(options: Namespace) -> Group:
     """Measure, and show it."""
-    return collection_table(*measure_collection(options.seed))
+    return Group(
+        collection_table(*measure_collection(options.seed)), collectors_table(measure_collectors(options.seed))
+    )
 
 
 def measure_collection(seed: int) -> tuple[int, dict[int, list[float]]]:
@@ -39,6 +43,22 @@ def measure_collection(seed: int) -> tuple[int, dict[int, list[float]]]:
         figures = zip(("bare", "one process", "two"), speeds[robots], strict=True)
         print(f"{robots:>5,} robots: {', '.join(f'{name} {speed:,.0f}/s' for name, speed in figures)}", flush=True)
     return config.collector.num_envs, speeds
+
+
+def measure_collectors(seed: int) -> dict[str, float]:
+    """Return robot-steps/s by collector, each with the default number of robots in each of its processes.
+
+    They are measured one after the other: one that does not wait for the learner would be at work in others' turns.
+    """
+    speeds = {}
+    for name in COLLECTORS:
+        config = reacher(seed, f"collector={name}")
+        torch.set_num_threads(config.threads)
+        size = config.collector
+        with _collection(config, size.num_envs, size.processes) as side:
+            (speeds[name],) = median_speeds(side, rounds=ROUNDS)
+        print(f"collector={name}: {speeds[name]:,.0f}/s", flush=True)
+    return speeds
 
 
 def _collection_speeds(config: TrainConfig, robots: int) -> list[float]:
@@ -59,11 +79,13 @@ def _collection(config: TrainConfig, robots: int, processes: int) -> Iterator[Ca
     """Make what a learner waits for: batches from so many robots in each process."""
     batches = 1 if robots < SMALL else STEPS_PER_ROUND * config.collector.num_envs // config.collector.frames_per_batch
     frames = STEPS_PER_ROUND // batches * robots * processes
-    size = CollectorConfig(num_envs=robots * processes, frames_per_batch=frames, processes=processes)
+    sizes = {"num_envs": robots * processes, "frames_per_batch": frames, "processes": processes}
+    size = config.collector.model_copy(update=sizes)
     make_robots = partial(make_env, config.env, config.randomization, config.normalization)
     env = make_robots(size.robots_here, config.seed)
     total_frames = (1 + ROUNDS) * batches * frames
-    collector = make_collector(size, env, make_robots, make_actor(config, env), total_frames, config.seed)
+    actor, cpu = make_actor(config, env), torch.device("cpu")
+    collector = make_collector(size, env, make_robots, actor, total_frames, config.seed, 0, cpu)
     source = iter(collector)
 
     def collect() -> int:
@@ -86,6 +108,16 @@ def collection_table(default: int, speeds: dict[int, list[float]]) -> Table:
         style, mark = ("bold", " (default)") if robots == default else (None, "")
         figures = f"{bare:,.0f}", f"{one:,.0f}", f"{one / bare:.2f}", f"{two:,.0f}", f"{two / one:.2f}"
         shown.add_row(f"{robots:,}{mark}", *figures, style=style)
+    return shown
+
+
+def collectors_table(speeds: dict[str, float]) -> Table:
+    """Show robot-steps per second of each collector."""
+    shown = table(
+        "Collectors, robot-steps/s: default robots a process, nothing learned", "collector", "speed", "of single"
+    )
+    for name, speed in speeds.items():
+        shown.add_row(name, f"{speed:,.0f}", f"{speed / speeds['single']:.2f}")
     return shown
 
 

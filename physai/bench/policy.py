@@ -43,10 +43,12 @@ def run(options: Namespace) -> Table:
 def measure_policy(seed: int) -> tuple[dict[str, np.ndarray], float]:
     """Return the times of single calls by form, s, and the median time to load a policy file, s."""
     with tempfile.TemporaryDirectory() as folder:
-        run = Path(folder)
-        make_run(run, seed, list(FILES))
+        run, recurrent = Path(folder) / "mlp", Path(folder) / "gru"
+        for path in (run, recurrent):
+            path.mkdir()
+            make_run(path, seed, list(FILES), f"policy={path.name}")
         loads = [_seconds(lambda: load_policy(run / FILES["torchscript"])) for _ in range(LOADS)]
-        forms = _forms(run)
+        forms = _forms(run) | {f"policy=gru: {name}": call for name, call in _exported(recurrent).items()}
         times: dict[str, list[list[float]]] = {name: [] for name in forms}
         with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
             for _ in range(ROUNDS + 1):  # they take turns, so that a busy machine slows them alike
@@ -55,10 +57,10 @@ def measure_policy(seed: int) -> tuple[dict[str, np.ndarray], float]:
     return {name: np.concatenate(rounds[1:]) for name, rounds in times.items()}, statistics.median(loads)
 
 
-def make_run(run: Path, seed: int, formats: list[str]) -> None:
+def make_run(run: Path, seed: int, formats: list[str], *overrides: str) -> None:
     """Train a little, and export the policy in these formats; how good it is does not matter here."""
     print(f"Exporting a policy that has seen {FRAMES:,} frames; how good it is does not matter ...", flush=True)
-    train_run(run, seed, f"total_frames={FRAMES}", "evaluation.episodes=100")
+    train_run(run, seed, f"total_frames={FRAMES}", "evaluation.episodes=100", *overrides)
     export_policy(run, "best", formats, episodes=10)
 
 
@@ -72,22 +74,34 @@ def train_run(run: Path, seed: int, *overrides: str) -> None:
         run_training(config, run)
 
 
-def _forms(run: Path) -> dict[str, Call]:
+def _exported(run: Path) -> dict[str, Call]:
+    """An exported policy, in its three forms."""
     actor, env = TrainedPolicy(run, "best").deploy(1, seed=0)
     moment = env.reset()
-    inputs = [moment.get(key) for key in INPUTS]
-    arrays = [value[0].numpy() for value in inputs]
     eager = make_deployable(actor, env)
     policy = load_policy(run / FILES["torchscript"])
     runtime = onnx.Runtime((run / FILES["onnx"]).read_bytes())
-    size = sum(moment.get(key).shape[-1] for key in actor.in_keys)
-    joints = len(policy.metadata.joints)
+    inputs = [moment.get(key) for key in policy.metadata.inputs]
+    arrays = [value[0].numpy() for value in inputs]
+    env.close()
+    return {
+        "artifact, eager": lambda: eager(*inputs),
+        "policy.pt, NumPy to NumPy": lambda: policy(*arrays),
+        "policy.onnx in ONNX Runtime": lambda: runtime(*inputs),
+    }
+
+
+def _forms(run: Path) -> dict[str, Call]:
+    actor, env = TrainedPolicy(run, "best").deploy(1, seed=0)
+    moment = env.reset()
+    sensed = {key: moment.get(key) for key in INPUTS}
+    size, joints = sum(moment.get(key).shape[-1] for key in actor.in_keys), env.action_spec.shape[-1]
     stock, silent = _stock_actor(size, joints, log_prob=True), _stock_actor(size, joints, log_prob=False)
     seen = TensorDict({"seen": torch.randn(1, size)}, [1])
     transforms = list(env.transform)[-2:]  # observation and its normalization
 
     def pipeline() -> None:
-        tensordict = TensorDict(dict(zip(INPUTS, inputs, strict=True)), [1])
+        tensordict = TensorDict(dict(sensed), [1])
         for transform in transforms:
             transform._step(tensordict, tensordict)
         stock(tensordict.set("seen", torch.cat([tensordict.get(key) for key in actor.in_keys], dim=-1)))
@@ -97,9 +111,7 @@ def _forms(run: Path) -> dict[str, Call]:
         "TorchRL's stock actor": lambda: stock(seen),
         "... without log-probability": lambda: silent(seen),
         "... behind the env's transforms": pipeline,
-        "artifact, eager": lambda: eager(*inputs),
-        "policy.pt, NumPy to NumPy": lambda: policy(*arrays),
-        "policy.onnx in ONNX Runtime": lambda: runtime(*inputs),
+        **_exported(run),
     }
 
 

@@ -41,7 +41,7 @@ def _update_speeds(seed: int, minibatch: int) -> list[float]:
 
         def update() -> int:
             agent.algorithm.update(batch.copy())
-            return agent.algorithm.epochs * batch.numel()
+            return int(config.algo["epochs"]) * batch.numel()
 
         return median_speeds(by_hand, update, rounds=ROUNDS)
     finally:

@@ -13,6 +13,7 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import multiprocessing
+from torchrl.collectors import MultiCollector
 
 from physai.collectors.worker import Acting, MakeEnv, WorkerCollector
 from physai.envs.make import TransformedRobotEnv
@@ -20,8 +21,8 @@ from physai.errors import UserError
 from physai.transforms.normalization import Normalizer
 
 
-class RobotMultiCollector:
-    """Several processes on this machine, each with robots of its own; before one of TorchRL's multi-collectors.
+class RobotMultiCollector(MultiCollector):
+    """Several processes on this machine, each with robots of its own.
 
     The policy and the normalizer with which a process acts lie in shared memory; the learner renews them between two
     batches of that process, when it stands still: no lock is needed that a killed process could keep.
@@ -33,8 +34,6 @@ class RobotMultiCollector:
         normalizer: The learner's; its copies are used.
         **torchrl: For TorchRL's collector.
     """
-
-    procs: list[Any]  # TorchRL's
 
     def __init__(
         self,
@@ -76,7 +75,7 @@ class RobotMultiCollector:
         Raises:
             UserError: If a worker has died.
         """
-        batches = super().iterator()  # type: ignore[misc]
+        batches = super().iterator()
         while True:
             with self._one_line():
                 batch = next(batches, None)
@@ -102,12 +101,12 @@ class RobotMultiCollector:
     def state(self) -> dict[str, Any]:
         """Return the state of all workers."""
         with self._one_line():
-            return dict(self.state_dict())  # type: ignore[attr-defined]
+            return dict(self.state_dict())
 
     def set_state(self, state: dict[str, Any]) -> None:
         """Restore what ``state`` returned, in a collector made from the same config."""
         with self._one_line():
-            self.load_state_dict(state)  # type: ignore[attr-defined]
+            self.load_state_dict(state)
 
 
 def _start_worker(learner: int, make_env: MakeEnv, normalizer: Normalizer, worker: int) -> TransformedRobotEnv:

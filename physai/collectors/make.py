@@ -1,6 +1,5 @@
 """The one place where a config becomes a collector."""
 
-import inspect
 from collections.abc import Callable
 from typing import Any
 
@@ -11,7 +10,7 @@ from physai.collectors.interface import FrameSource
 from physai.collectors.multi_async import RobotMultiAsyncCollector
 from physai.collectors.multi_sync import RobotMultiSyncCollector
 from physai.collectors.single import RobotCollector
-from physai.config import Config, Count, nearest
+from physai.config import Config, Count
 from physai.envs.make import TransformedRobotEnv
 from physai.errors import UserError
 from physai.seeding import derive
@@ -71,7 +70,9 @@ def make_collector(
         raise UserError(f"collector.num_envs ({robots}) must be a multiple of collector.processes ({processes})")
     if frames % robots:
         raise UserError(f"collector.frames_per_batch ({frames}) must be a multiple of collector.num_envs ({robots})")
-    sizes = {
+    if config.ray_init is not None and not config.sync:
+        raise UserError("collector.sync must be true where there is a collector.ray_init")
+    sizes: dict[str, Any] = {
         "frames_per_batch": frames,
         "total_frames": -(-total_frames // frames) * frames,
         "init_random_frames": -(-warmup_frames // frames) * frames,
@@ -89,5 +90,9 @@ def make_collector(
 
     parts = processes, make_worker_env, policy, env.normalization.normalizer
     if config.ray_init is not None:
-        return _ray_collector(config.ray_init)(*parts, **sizes)
+        try:
+            from physai.collectors.ray import RobotRayCollector  # it takes its time, and is there only if wanted
+        except ModuleNotFoundError as error:
+            raise UserError(f"collector.ray_init needs {error.name}: pip install 'physai[ray]'") from None
+        return RobotRayCollector(*parts, ray_init=config.ray_init, **sizes)
     return (RobotMultiSyncCollector if config.sync else RobotMultiAsyncCollector)(*parts, **sizes)

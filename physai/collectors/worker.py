@@ -50,7 +50,7 @@ class WorkerCollector(RobotCollector):
         """Return the state of the env and of this process' random numbers."""
         return self.state() | {"random": torch.get_rng_state()}
 
-    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Restore what ``state_dict`` returned."""
+    def load_state_dict(self, state_dict: dict[str, Any], strict: bool = True) -> None:
+        """Restore what ``state_dict`` returned; ``strict`` is TorchRL's."""
         self.set_state(state_dict)
         torch.set_rng_state(state_dict["random"])

@@ -87,12 +87,12 @@ class Metadata:
     @property
     def inputs(self) -> tuple[str, ...]:
         """What the policy takes, in order."""
-        return inputs(self.memory_size)
+        return input_keys(self.memory_size)
 
     @property
     def outputs(self) -> tuple[str, ...]:
         """What it gives, in order."""
-        return outputs(self.memory_size)
+        return output_keys(self.memory_size)
 
     @classmethod
     def parse(cls, text: str) -> "Metadata":
@@ -125,7 +125,7 @@ class Metadata:
         memory_size = _memory_size(raw)
         sizes = {"joint_position": n, "joint_velocity": n, "goal": 2, OUTPUT: n, MEMORY: memory_size}
         sizes[NEW_MEMORY] = memory_size
-        for side, keys in (("inputs", inputs(memory_size)), ("outputs", outputs(memory_size))):
+        for side, keys in (("inputs", input_keys(memory_size)), ("outputs", output_keys(memory_size))):
             if _get(raw, side, dict) != {key: ["N", sizes[key]] for key in keys}:
                 raise PolicyError(f"metadata: {side} must be {list(keys)}")
         if _get(raw, "units", dict) != UNITS:
@@ -136,7 +136,7 @@ class Metadata:
         if not 0 < pairs <= MAX_PAIRS:
             raise PolicyError(f"metadata: there are {pairs:,} golden pairs, not 1 to {MAX_PAIRS:,}")
         sizes[DISTANCE] = 1
-        recorded = (*inputs(memory_size), *outputs(memory_size), DISTANCE)
+        recorded = (*input_keys(memory_size), *output_keys(memory_size), DISTANCE)
         found = cls(
             raw=raw,
             robot=_get(raw, "robot.name", str),
@@ -160,12 +160,12 @@ class Metadata:
         return found
 
 
-def inputs(memory_size: int) -> tuple[str, ...]:
+def input_keys(memory_size: int) -> tuple[str, ...]:
     """What a policy takes, in order."""
     return (*INPUTS, MEMORY) if memory_size else INPUTS
 
 
-def outputs(memory_size: int) -> tuple[str, ...]:
+def output_keys(memory_size: int) -> tuple[str, ...]:
     """What a policy gives, in order."""
     return (OUTPUT, NEW_MEMORY) if memory_size else (OUTPUT,)
 

@@ -133,16 +133,10 @@ class RobotVectorEnv(VectorEnv[Array, Array, Array]):
 
     def step(self, actions: Array) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
         """Apply actions [N, n]; rows whose episode is over start a new one instead."""
-        fresh = self._over
-        reward, terminated, truncated = self.simulation.step(np.asarray(actions, np.float32))
-        if fresh.any():
-            self.simulation.reset(fresh)
-            reward, terminated, truncated = (
-                np.where(fresh[:, None], np.zeros_like(value), value) for value in (reward, terminated, truncated)
-            )
-        self._over = (terminated | truncated)[:, 0]
-        info = {"is_success": terminated[:, 0], "distance": self.simulation.distance[:, 0]}
-        reward, terminated, truncated = reward[:, 0], terminated[:, 0], truncated[:, 0]
+        ended = self.simulation.step(np.asarray(actions, np.float32), restart=self._over)
+        reward, terminated, truncated = (column[:, 0] for column in ended)
+        self._over = terminated | truncated
+        info = {"is_success": terminated, "distance": self.simulation.distance[:, 0]}
         return self.simulation.observe(), reward, terminated, truncated, info
 
     def render(self) -> tuple[Array, ...] | None:

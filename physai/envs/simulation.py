@@ -119,7 +119,10 @@ class Simulation:
 
     def reset(self, rows: np.ndarray | None = None, parameters: np.ndarray | None = None) -> None:
         """Start new episodes in the rows of a mask [N] (all by default), with new parameters [N, P] if given."""
-        index = np.arange(self.num_envs) if rows is None else rows.nonzero()[0]
+        self._begin(np.arange(self.num_envs) if rows is None else rows.nonzero()[0], parameters)
+        self._read(*self.physics.joint_state())
+
+    def _begin(self, index: np.ndarray, parameters: np.ndarray | None = None) -> None:
         start = self.task.sample_start(len(index), self.spec, self.generator)
         self.goal = _replaced(self.goal, index, self.task.sample_goal(len(index), self.generator))
         self.episode_length = _replaced(self.episode_length, index, 0)
@@ -130,20 +133,35 @@ class Simulation:
             self.physics_parameters = _replaced(self.physics_parameters, index, new)
             dynamics = self.layout.dynamics(new)
         self.physics.reset(index, start, np.zeros_like(start), dynamics)
-        self._read(*self.physics.joint_state())
 
-    def step(self, action: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def step(
+        self, action: np.ndarray, restart: np.ndarray | None = None
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Apply actions [N, n] in [-1, 1] for one control period.
+
+        Args:
+            action: The actions.
+            restart: Rows [N] that start a new episode instead; there nothing is earned, and nothing ends.
 
         Returns:
             reward, terminated, truncated, each [N, 1]. Reaching the goal terminates; running out of time truncates,
             and a step that does both only terminates.
         """
         command = np.maximum(np.minimum(action, 1.0), -1.0) * np.float64(self.config.max_velocity)
-        self._read(*self.physics.step(command))
+        joint_state = self.physics.step(command)
+        length = self.episode_length + 1
+        if restart is not None and restart.any():
+            index = restart.nonzero()[0]
+            self._begin(index)
+            joint_state, length[index] = self.physics.joint_state(), 0
+        else:
+            index = None
+        self._read(*joint_state)
         terminated = self.task.success(self.distance)
         reward = self.task.reward(self.distance, terminated).astype(np.float32)
-        self.episode_length = self.episode_length + 1
+        if index is not None:
+            terminated[index], reward[index] = False, 0.0
+        self.episode_length = length
         self.episode_return = self.episode_return + reward
         truncated = (self.episode_length >= self.task.max_steps) & ~terminated
         return reward, terminated, truncated
@@ -163,7 +181,7 @@ class Simulation:
         command = [min(max(share, -1.0), 1.0) * fastest for share in action.tolist()]
         joint_position, joint_velocity = self.physics.step(np.array([command]))
         (position,), (velocity,), (goal,) = joint_position.tolist(), joint_velocity.tolist(), self.goal.tolist()
-        tip = self._tip(position, math)
+        tip = self._tip.of_one(position)
         distance = math.dist(tip, goal)
         terminated = self.task.success(distance)
         reward = self.task.reward(distance, terminated)
@@ -178,12 +196,12 @@ class Simulation:
     def observe(self) -> np.ndarray:
         """Return what a policy sees of the true state, [N, 2n + 4]: the same as the module ``observation`` makes."""
         columns = self.joint_position.T.astype(float), self.joint_velocity.T, self.end_effector.T, self.goal.T
-        return np.stack(self.task.observe(self._continuous, *columns), axis=1, dtype=np.float32)
+        return _table(self.task.observe(self._continuous, *columns))
 
     def _read(self, joint_position: np.ndarray, joint_velocity: np.ndarray) -> None:
         self.joint_position = joint_position.astype(np.float32)
         self.joint_velocity = joint_velocity.astype(np.float32)
-        self.end_effector = np.stack(self._tip(joint_position.T, np), axis=1, dtype=np.float32)
+        self.end_effector = _table(self._tip.of_many(joint_position))
         error = self.end_effector - self.goal
         self.distance = np.hypot(error[:, :1], error[:, 1:])
 
@@ -214,6 +232,13 @@ class Simulation:
     def close(self) -> None:
         """Free the physics engine."""
         self.physics.close()
+
+
+def _table(columns: Any) -> np.ndarray:
+    table = np.empty((len(columns[0]), len(columns)), np.float32)
+    for index, column in enumerate(columns):  # a third of the time of np.stack
+        table[:, index] = column
+    return table
 
 
 def _replaced(array: np.ndarray, rows: np.ndarray, values: np.ndarray | float) -> np.ndarray:

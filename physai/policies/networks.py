@@ -79,7 +79,7 @@ class GaussianActor(TensorDictModuleBase):
         initial_std: Standard deviation of the first policy.
     """
 
-    out_keys = ("action", "latent_action", "action_log_prob")
+    out_keys: tuple[str, ...] = ("action", "latent_action", "action_log_prob")
     # Where TorchRL's losses look for what was sampled:
     dist_sample_keys = ("latent_action",)
     log_prob_keys = ("action_log_prob",)

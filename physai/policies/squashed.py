@@ -39,15 +39,12 @@ class TanhGaussianActor(TensorDictModuleBase):
     ) -> None:
         super().__init__()
         self.in_keys = in_keys
-        self.spec = Composite(action=Bounded(-1.0, 1.0, (action_size,)))  # SACLoss takes its target entropy from its size
+        self.spec = Composite(action=Bounded(-1.0, 1.0, (action_size,)))  # its size gives SACLoss a target entropy
         self.network = mlp(in_features, hidden_sizes, 2 * action_size, activation, orthogonal=False)
 
     def deterministic(self) -> nn.Module:
         """What acts without exploration, scriptable: ``in_keys`` side by side, [N, in_features], to actions [N, n]."""
-        *body, last = self.network
-        mean = nn.Linear(last.in_features, last.out_features // 2)
-        mean.load_state_dict({key: value[: mean.out_features] for key, value in last.state_dict().items()})
-        return nn.Sequential(*body, mean, nn.Tanh())
+        return nn.Sequential(*self.network, _FirstHalf(), nn.Tanh())
 
     def _mean_and_std(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
         mean, log_std = self.network(side_by_side(tensordict, self.in_keys)).chunk(2, dim=-1)
@@ -65,6 +62,13 @@ class TanhGaussianActor(TensorDictModuleBase):
         if exploration_type() == ExplorationType.RANDOM:
             mean = torch.addcmul(mean, std, torch.randn_like(mean))
         return tensordict.set("action", torch.tanh(mean))
+
+
+class _FirstHalf(nn.Module):
+    """The mean of what the network says; a layer for the mean alone would round it otherwise."""
+
+    def forward(self, output: Tensor) -> Tensor:
+        return output.chunk(2, dim=-1)[0]
 
 
 class DeterministicActor(TensorDictModuleBase):

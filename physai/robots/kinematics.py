@@ -1,7 +1,6 @@
 """Forward kinematics as a small torch module: one implementation for simulation, policy and robot."""
 
-from types import ModuleType
-from typing import Any
+import math
 
 import numpy as np
 import torch
@@ -82,7 +81,7 @@ class TipPosition:
     """What :class:`ForwardKinematics` says of the end effector's place in the plane, without torch.
 
     At every step of a simulation, calling torch costs more than what it computes. The matrices are those of the module;
-    only their product is written again, for one arm in plain numbers as for many in arrays.
+    only their product is written again, for one arm in plain numbers and for many in arrays.
 
     Args:
         kinematics: The module.
@@ -91,28 +90,37 @@ class TipPosition:
     def __init__(self, kinematics: ForwardKinematics) -> None:
         terms = [kinematics.constant, kinematics.cosine, kinematics.sine]
         *before, last = np.stack([term[:, :3].double().numpy() for term in terms], axis=1)  # n of [3 terms, 3, 4]
-        rows = [last[:, :, 3].T.tolist()]  # of the last joint, what the three terms make of the tip
-        for terms in before[::-1]:
-            # Of the others, where the joint is, for turning moves no origin, and a row of each of the three matrices.
-            rows.append([(terms[0, row, 3].item(), *terms[:, row, :3].ravel().tolist()) for row in range(3)])
-        del rows[-1][2]  # the height in the end
-        self._tip, *self._joints = rows
+        self._tip = last[:, :, 3].T  # of the last joint, what the three terms make of the tip: [3, 3 terms]
+        # Of the others, from the tip to the base: where the joint is, for turning moves no origin, and the rows of the
+        # three matrices side by side, [3, 9].
+        joints = [(terms[0, :, 3], np.concatenate(terms[:, :, :3], axis=1)) for terms in before[::-1]]
+        if joints:  # the height in the end is not asked for
+            joints[-1] = joints[-1][0][:2], joints[-1][1][:2]
+        else:
+            self._tip = self._tip[:2]
+        self._joints = [(origin[:, None], rows) for origin, rows in joints]
+        self._tip_numbers = self._tip.tolist()
+        self._joint_numbers = [list(zip(origin.tolist(), *rows.T.tolist(), strict=True)) for origin, rows in joints]
 
-    def __call__(self, joint_position: Any, xp: ModuleType) -> list[Any]:
-        """Map n joint positions, rad, to x and y, m.
-
-        Args:
-            joint_position: A list of numbers, or an array [n, ...].
-            xp: Where their ``cos`` and ``sin`` come from: ``math``, or NumPy.
-        """
-        cos, sin = xp.cos, xp.sin
-        c, s = cos(joint_position[-1]), sin(joint_position[-1])
-        point = [a + b * c + d * s for a, b, d in self._tip]
-        for angle, rows in zip(joint_position[-2::-1], self._joints, strict=True):
+    def of_one(self, joint_position: list[float]) -> list[float]:
+        """Map n joint positions, rad, to x and y, m."""
+        c, s = math.cos(joint_position[-1]), math.sin(joint_position[-1])
+        point = [a + b * c + d * s for a, b, d in self._tip_numbers]
+        for angle, rows in zip(joint_position[-2::-1], self._joint_numbers, strict=True):
             x, y, z = point
-            c, s = cos(angle), sin(angle)
+            c, s = math.cos(angle), math.sin(angle)
             point = [
                 at + ax * x + ay * y + az * z + (bx * x + by * y + bz * z) * c + (cx * x + cy * y + cz * z) * s
                 for at, ax, ay, az, bx, by, bz, cx, cy, cz in rows
             ]
+        return point
+
+    def of_many(self, joint_position: np.ndarray) -> np.ndarray:
+        """Map joint positions [N, n], rad, to x and y, m, [2, N]."""
+        cosine, sine = np.cos(joint_position.T), np.sin(joint_position.T)
+        constant, by_cosine, by_sine = self._tip.T[:, :, None]
+        point = constant + by_cosine * cosine[-1] + by_sine * sine[-1]
+        for c, s, (origin, rows) in zip(cosine[-2::-1], sine[-2::-1], self._joints, strict=True):
+            # einsum adds up in the same order for one arm and for many, which matrix products do not.
+            point = origin + np.einsum("ij,jk->ik", rows, np.concatenate([point, point * c, point * s]))
         return point

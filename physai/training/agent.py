@@ -1,5 +1,6 @@
 """The parts of a run, built from its config; and the trained part of them, read back from a file."""
 
+import copy
 import hashlib
 import logging
 from dataclasses import dataclass
@@ -12,9 +13,10 @@ from hydra.errors import InstantiationException
 from hydra.utils import instantiate
 from tensordict.nn import TensorDictModuleBase
 from torchrl.data import Composite
+from torchrl.record.loggers import TensorboardLogger
 
 from physai.algorithms import Algorithm, Networks
-from physai.collectors import RobotCollector, RobotMultiCollector, make_collector
+from physai.collectors import FrameSource, make_collector
 from physai.envs.make import TransformedRobotEnv, make_env
 from physai.errors import UserError
 from physai.physics import RandomizationConfig
@@ -33,7 +35,7 @@ class Agent:
     actor: TensorDictModuleBase
     critic: TensorDictModuleBase
     algorithm: Algorithm
-    collector: RobotCollector | RobotMultiCollector
+    collector: FrameSource
 
     @classmethod
     def build(cls, config: TrainConfig) -> "Agent":
@@ -47,22 +49,34 @@ class Agent:
                 f"env={config.env.name}: a policy is trained on simulated robots; this one it can drive with "
                 f"python -m physai.evaluate run=<run> env={config.env.name}"
             )
+        device = torch.device(config.device)
+        if device.type == "cuda" and (device.index or 0) >= torch.cuda.device_count():
+            raise UserError(f"device={config.device}: torch finds {torch.cuda.device_count()} GPUs here")
         torch.set_num_threads(config.threads)
         torch.manual_seed(derive(config.seed, "learner"))
         memory = config.policy.memory_size
         make_robots = partial(make_env, config.env, config.randomization, config.normalization, memory_size=memory)
         env = make_robots(config.collector.robots_here, derive(config.seed, "train"))
-        actor = make_actor(config, env)
+        actor = make_actor(config, env).to(device)
         judged = Composite(**env.observation_spec, **env.full_action_spec, shape=env.batch_size)
         inputs = input_size(judged, config.policy.critic["in_keys"], "policy.critic")
-        critic = _make("policy.critic", config.policy.critic, in_features=inputs)
+        critic = _make("policy.critic", config.policy.critic, in_features=inputs).to(device)
         algorithm = _make(
             "algo",
             config.algo,
             networks=Networks(actor, critic, env.normalization.normalizer),
             frames_per_batch=config.collector.frames_per_batch,
         )
-        collector = make_collector(config.collector, env, make_robots, actor, config.total_frames, config.seed)
+        collector = make_collector(
+            config.collector,
+            env,
+            make_robots,
+            actor,
+            config.total_frames,
+            config.seed,
+            algorithm.warmup_frames,
+            device,
+        )
         return cls(env, actor, critic, algorithm, collector)
 
     def weights_sha256(self) -> str:
@@ -71,13 +85,22 @@ class Agent:
         for weights in (self.algorithm.weights(), self.env.normalization.state_dict()):
             for name, value in sorted(weights.items()):
                 digest.update(name.encode())
-                digest.update(value.contiguous().numpy().tobytes())
+                digest.update(value.cpu().contiguous().numpy().tobytes())
         return digest.hexdigest()
+
+    @property
+    def on_gpu(self) -> bool:
+        """Whether the networks are not where the robots are."""
+        return next(self.actor.parameters()).is_cuda
+
+    def policy(self) -> TensorDictModuleBase:
+        """The actor where robots are, on the CPU."""
+        return copy.deepcopy(self.actor).cpu() if self.on_gpu else self.actor
 
     def policy_state(self) -> dict[str, Any]:
         """What acting needs: the actor's weights and the normalization statistics."""
         return {
-            "actor": {key: value.clone() for key, value in self.actor.state_dict().items()},
+            "actor": {key: value.cpu().clone() for key, value in self.actor.state_dict().items()},
             "normalization": {key: value.clone() for key, value in self.env.normalization.state_dict().items()},
         }
 
@@ -111,8 +134,19 @@ def make_evaluation_env(
 
 
 def make_logger(config: TrainConfig, run_dir: Path) -> Any:
-    """Build the TorchRL logger."""
-    return _make("logger", config.logger, log_dir=str(run_dir))
+    """Build the TorchRL logger, and tell it the config."""
+    logger = _make("logger", config.logger, log_dir=str(run_dir))
+    if not isinstance(logger, TensorboardLogger):  # which would show the config as a run of its own
+        logger.log_hparams(_flat(config.model_dump(exclude={"logger", "resume"})))
+    return logger
+
+
+def _flat(node: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Key and value of each leaf, as they are given on the command line."""
+    leaves: dict[str, Any] = {}
+    for key, value in node.items():
+        leaves |= _flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {f"{prefix}{key}": value}
+    return leaves
 
 
 def _make(where: str, node: dict[str, Any], **parts: Any) -> Any:

@@ -1,6 +1,8 @@
 """Types and ranges of ``conf/train.yaml``; the values are there."""
 
-from typing import Literal
+from typing import Annotated, Literal
+
+from pydantic import Field
 
 from physai.collectors import CollectorConfig
 from physai.config import Config, Count, Seed, Target
@@ -37,6 +39,13 @@ class PolicyConfig(Config):
         return int(self.actor.get("memory_size", 0))
 
 
+class ObjectiveConfig(Config):
+    """One file of ``conf/objective``: what a sweep with Optuna makes best."""
+
+    direction: Literal["maximize", "minimize"]
+    target: Annotated[float, Field(gt=0, le=1)] | None
+
+
 class TrainConfig(Config):
     """Everything that decides the outcome of a run."""
 
@@ -48,9 +57,10 @@ class TrainConfig(Config):
     normalization: NormalizationConfig
     checkpoint: CheckpointConfig
     evaluation: EvaluationConfig
+    objective: ObjectiveConfig
     logger: Target
     seed: Seed
     total_frames: Count
-    device: Literal["cpu"]
+    device: Annotated[str, Field(pattern=r"^(cpu|cuda(:\d+)?)$")]
     threads: Count
     resume: None  # the command takes it before a config is made

@@ -107,8 +107,7 @@ class RunLog:
         self._metrics.write(frames=frames, iteration=iteration, **values)
         self._metrics.flush()
         self._episodes.flush()
-        for key, value in values.items():
-            self._logger.log_scalar(key, value, step=frames)
+        self._logger.log_metrics(values, step=frames)
 
     def state(self) -> dict[str, Any]:
         """Bring everything to the disk and return what continues the files from here."""
@@ -124,6 +123,4 @@ class RunLog:
         self._episodes.close()
         if self._metrics is not None:
             self._metrics.close()
-        writer = getattr(self._logger, "experiment", None)
-        if writer is not None:
-            writer.close()
+        self._logger.close()

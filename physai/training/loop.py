@@ -169,7 +169,7 @@ class _Judge:
             robots = min(settings.goals, MAX_ROBOTS)
             self._env = make_evaluation_env(self._config, settings.randomization, robots, EVALUATION_SEED)
         self._env.normalization.load_state_dict(agent.env.normalization.state_dict())
-        return evaluate(agent.actor, self._env, settings.goals, EVALUATION_SEED)
+        return evaluate(agent.policy(), self._env, settings.goals, EVALUATION_SEED)
 
     def close(self) -> None:
         if self._env is not None:
@@ -210,6 +210,7 @@ def _save(agent: Agent, clock: Clock, log: RunLog, folder: checkpoint.Checkpoint
         "algorithm": agent.algorithm.state(),
         "collector": agent.collector.state(),
         "random": torch.get_rng_state(),
+        "random_on_gpus": torch.cuda.get_rng_state_all() if agent.on_gpu else [],
         "log": log.state(),
     }
     folder.save(clock.frames, content)
@@ -221,6 +222,7 @@ def _restore(agent: Agent, content: dict[str, Any]) -> tuple[Clock, dict[str, An
         agent.collector.set_state(content["collector"])
         agent.env.normalization.load_state_dict(content["normalization"])  # robots in other processes bring none along
         torch.set_rng_state(content["random"])
+        torch.cuda.set_rng_state_all(content["random_on_gpus"])
         return Clock(**content["clock"]), content["log"]
     except (RuntimeError, KeyError, TypeError, ValueError) as error:
         raise UserError(f"the checkpoint does not fit the run's config: {str(error).splitlines()[0][:120]}") from None

@@ -9,7 +9,8 @@ from torchrl.envs.transforms import Transform
 class Memory(Transform):
     """Hands the policy as ``memory`` what it wrote as ``new_memory`` a step before; zeros where an episode begins.
 
-    (TorchRL's recurrent modules write ``("next", key)`` themselves, and a primer resets it; our envs make ``next`` anew.)
+    (TorchRL's recurrent modules write ``("next", key)`` themselves, with a primer that resets it; our envs make
+    ``next`` anew at each step.)
 
     Args:
         size: H.

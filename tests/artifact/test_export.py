@@ -131,8 +131,8 @@ def test_a_file_for_joints_in_another_order_is_refused_before_it_is_written(copi
         path.unlink()
     described = module.describe.describe_robot
 
-    def swapped(simulation):
-        content = described(simulation)
+    def swapped(*parts):
+        content = described(*parts)
         content["robot"]["joints"].reverse()
         return content
 

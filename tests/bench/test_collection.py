@@ -19,3 +19,16 @@ def test_the_bare_loop_one_process_and_two_are_timed_and_shown(monkeypatch):
     shown = console.export_text()
     for part in ("bare PyBullet", "one process", "two processes", f"{default} (default)"):
         assert part in shown
+
+
+@pytest.mark.slow
+def test_every_collector_is_timed_and_shown(monkeypatch):
+    monkeypatch.setattr(collection, "COLLECTORS", ("single", "multi_async"))
+    monkeypatch.setattr(collection, "ROUNDS", 1)
+    monkeypatch.setattr(collection, "STEPS_PER_ROUND", 8)
+    speeds = collection.measure_collectors(seed=0)
+    assert all(speed > 0 for speed in speeds.values())
+    console = Console(width=120, record=True)
+    console.print(collection.collectors_table(speeds))
+    for part in ("single", "multi_async", "1.00"):
+        assert part in console.export_text(clear=False)

@@ -12,11 +12,11 @@ def test_every_form_is_timed_and_shown(monkeypatch):
     monkeypatch.setattr(policy, "ROUNDS", 2)
     monkeypatch.setattr(policy, "CALLS", 20)
     times, load = policy.measure_policy(seed=0)
-    assert len(times) == 6
+    assert len(times) == 9
     assert all(len(seconds) == 40 and (seconds > 0).all() for seconds in times.values())
     assert 0 < load < 5
     console = Console(width=120, record=True)
     console.print(policy.policy_table(times, load))
     shown = console.export_text()
-    for part in ("stock actor", "policy.pt", "ONNX Runtime", "µs", "1.00"):
+    for part in ("stock actor", "policy.pt", "ONNX Runtime", "policy=gru: policy.pt", "µs", "1.00"):
         assert part in shown

@@ -4,48 +4,16 @@ import subprocess
 import sys
 import time
 from itertools import pairwise
-from multiprocessing import active_children
 
 import pytest
 import torch
 
-from physai.collectors import CollectorConfig, make_collector
-from physai.envs.make import make
 from physai.errors import UserError
-from physai.policies import GaussianActor
-
-
-def robots(num_envs, seed):
-    return make("reacher", num_envs, seed)
-
-
-@pytest.fixture
-def collect():
-    """Make a collector of two processes that ends with the test, and what it shares with them."""
-    made = []
-
-    def build(seed=0, total=1024):
-        torch.manual_seed(0)
-        actor = GaussianActor(8, 2, ["normalized_observation"], [16], "torch.nn.Tanh", 1.0)
-        env = robots(1, seed)
-        config = CollectorConfig(num_envs=8, frames_per_batch=128, processes=2)
-        made.append((make_collector(config, env, robots, actor, total, seed), env))
-        return made[-1][0], actor, env.normalization
-
-    yield build
-    for collector, env in made:
-        collector.shutdown()
-        env.close()
-    assert not active_children()
-
-
-def assert_equal(ours, theirs):
-    for key in ours.keys(True, True):
-        assert torch.equal(ours[key], theirs[key]), key
+from tests.collectors.parts import assert_equal
 
 
 def test_batches_are_robots_by_steps_and_no_two_robots_are_alike(collect):
-    source, *_ = collect(total=300)
+    source, *_ = collect("multi_sync", total=300)
     batches = [batch.clone() for batch in source]
     assert [batch.shape for batch in batches] == [(8, 16)] * 3  # rounded up to whole batches
     assert len(batches[0]["goal"][:, 0].unique(dim=0)) == 8
@@ -57,7 +25,7 @@ def test_batches_are_robots_by_steps_and_no_two_robots_are_alike(collect):
 
 
 def test_all_processes_see_the_learner_s_weights_and_normalization_from_the_next_batch_on(collect):
-    source, actor, normalization = collect()
+    source, actor, normalization = collect("multi_sync")
     batches = iter(source)
     for _ in range(4):
         batch = next(batches)
@@ -72,12 +40,12 @@ def test_all_processes_see_the_learner_s_weights_and_normalization_from_the_next
 
 def test_the_learner_s_process_stays_as_it_was(collect):
     before = torch.get_num_threads(), torch.multiprocessing.get_start_method(allow_none=True)
-    collect()
+    collect("multi_sync")
     assert (torch.get_num_threads(), torch.multiprocessing.get_start_method(allow_none=True)) == before
 
 
 def test_a_worker_that_is_gone_when_it_is_asked_for_its_state_is_an_error_of_one_line(collect):
-    source, *_ = collect()
+    source, *_ = collect("multi_sync")
     next(iter(source))
     os.kill(source.procs[0].pid, signal.SIGKILL)
     source.procs[0].join()
@@ -86,27 +54,27 @@ def test_a_worker_that_is_gone_when_it_is_asked_for_its_state_is_an_error_of_one
 
 
 def test_the_same_seed_gives_the_same_frames(collect):
-    (first, *_), (again, *_), (other, *_) = collect(seed=1), collect(seed=1), collect(seed=2)
+    (first, *_), (again, *_), (other, *_) = (collect("multi_sync", seed=seed) for seed in (1, 1, 2))
     for ours, theirs, _ in zip(first, again, range(2), strict=False):
         assert_equal(ours, theirs)
     assert not torch.isclose(next(iter(other))["goal"], ours["goal"]).any()
 
 
 def test_state_continues_bit_for_bit_in_new_processes(collect):
-    source, _, normalization = collect(seed=3)
+    source, _, normalization = collect("multi_sync", seed=3)
     batches = iter(source)
     for _ in range(2):
         normalization.update(next(batches)["observation"])
     state, statistics = source.state(), normalization.state_dict()
     expected = next(batches).clone()
-    other, _, fresh = collect(seed=99)
+    other, _, fresh = collect("multi_sync", seed=99)
     fresh.load_state_dict(statistics)
     other.set_state(state)
     assert_equal(expected, next(iter(other)))
 
 
 def test_a_killed_worker_ends_collection_with_an_error_and_takes_the_others_along(collect):
-    source, *_ = collect()
+    source, *_ = collect("multi_sync")
     batches = iter(source)
     next(batches)
     os.kill(source.procs[1].pid, signal.SIGKILL)
@@ -118,11 +86,9 @@ def test_a_killed_worker_ends_collection_with_an_error_and_takes_the_others_alon
 
 
 LEARNER = """
-import time
-from tests.collectors import test_multi_sync as parts
-config = parts.CollectorConfig(num_envs=8, frames_per_batch=128, processes=2)
-actor = parts.GaussianActor(8, 2, ["normalized_observation"], [16], "torch.nn.Tanh", 1.0)
-source = parts.make_collector(config, parts.robots(1, 0), parts.robots, actor, 10**9, 0)
+import sys
+from tests.collectors import parts
+source = parts.source(sys.argv[1], parts.actor(), parts.robots(1, 0), 10**9)
 for _ in source:
     print(*(process.pid for process in source.procs), flush=True)
 """
@@ -137,8 +103,9 @@ def is_alive(pid):
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="a signal at the death of the parent is Linux's")
-def test_workers_die_with_a_learner_that_is_killed():
-    learner = subprocess.Popen([sys.executable, "-c", LEARNER], stdout=subprocess.PIPE, text=True)
+@pytest.mark.parametrize("kind", ["multi_sync", "multi_async"])
+def test_workers_die_with_a_learner_that_is_killed(kind):
+    learner = subprocess.Popen([sys.executable, "-c", LEARNER, kind], stdout=subprocess.PIPE, text=True)
     workers = []
     while len(workers) != 2:
         workers = [int(word) for word in learner.stdout.readline().split() if word.isdigit()]

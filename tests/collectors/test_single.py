@@ -3,20 +3,13 @@ from pathlib import Path
 import pytest
 import torch
 
-from physai.collectors import CollectorConfig, make_collector
-from physai.envs.make import make
-from physai.policies import GaussianActor
-
-
-def robots(num_envs, seed):
-    return make("reacher", num_envs, seed)
+from physai.collectors import make_collector
+from tests.collectors import parts
 
 
 def collector(frames=256, total=1024, seed=0):
-    torch.manual_seed(0)
-    actor = GaussianActor(8, 2, ["normalized_observation"], [16], "torch.nn.Tanh", 1.0)
-    config = CollectorConfig(num_envs=16, frames_per_batch=frames, processes=1)
-    return make_collector(config, robots(16, seed), robots, actor, total, seed)
+    config, env = parts.config("single", 16, frames), parts.robots(16, seed)
+    return make_collector(config, env, parts.robots, parts.actor(), total, seed, 0, parts.CPU)
 
 
 def test_one_set_of_statistics_holds_for_a_whole_batch():
@@ -47,8 +40,7 @@ def test_state_continues_bit_for_bit_in_a_new_collector():
     torch.set_rng_state(random)
     got = next(iter(other))
     other.shutdown()
-    for key in expected.keys(True, True):
-        assert torch.equal(expected[key], got[key]), key
+    parts.assert_equal(expected, got)
 
 
 def resident_megabytes():

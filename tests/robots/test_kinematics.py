@@ -1,4 +1,3 @@
-import math
 
 import numpy as np
 import pybullet as bullet
@@ -150,8 +149,8 @@ def assert_same_in_numbers_and_arrays(spec):
     joint_position = random_positions(200, len(spec.joints), seed=3).double()
     expected = kinematics(joint_position)[:, :2].numpy()
     q = joint_position.numpy()
-    np.testing.assert_allclose(np.stack(tip(q.T, np), axis=1), expected, rtol=0, atol=1e-12)
-    np.testing.assert_allclose([tip(row, math) for row in q.tolist()], expected, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(tip.of_many(q).T, expected, rtol=0, atol=1e-12)
+    np.testing.assert_allclose([tip.of_one(row) for row in q.tolist()], expected, rtol=0, atol=1e-12)
 
 
 def test_the_tip_s_place_without_torch_is_that_of_the_module(spec):

@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 from physai.config import compose, validate
 from physai.training.config import TrainConfig
@@ -25,7 +26,7 @@ def small_config(*overrides: str) -> TrainConfig:
     return validate(TrainConfig, compose("train", [*SMALL, *overrides]))
 
 
-def command(module: str, *arguments: str, cwd: Path) -> subprocess.Popen[str]:
+def command(module: str, *arguments: str, cwd: Path, **options: Any) -> subprocess.Popen[str]:
     """Start a physai command as a user would, in a process of its own."""
     return subprocess.Popen(
         [sys.executable, "-m", f"physai.{module}", *arguments],
@@ -34,6 +35,7 @@ def command(module: str, *arguments: str, cwd: Path) -> subprocess.Popen[str]:
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,
+        **options,
     )
 
 

@@ -1,0 +1,99 @@
+import os
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import torch
+
+from tests.collectors import parts
+from tests.training.processes import all_gone, command_of, descendants
+from tests.training.small import SMALL, command
+
+pytest.importorskip("ray")
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(sys.platform != "linux", reason="processes are found in /proc"),
+]
+
+
+def learn(batch, policy, normalization):
+    normalization.update(batch["observation"])
+    with torch.no_grad():
+        for parameter in policy.parameters():
+            parameter.add_(0.1)
+
+
+def test_frames_are_those_of_processes_without_ray_and_go_on_bit_for_bit(collect):
+    """With random frames, and with weights and statistics that change."""
+    before = descendants(os.getpid())
+    plain, *learner = collect("multi_sync", warmup=128)
+    expected = []
+    for _, batch in zip(range(4), plain, strict=False):
+        expected.append(batch.clone())
+        learn(batch, *learner)
+    plain.shutdown()
+
+    source, policy, normalization = collect("ray", warmup=128)
+    for ours, theirs in zip(expected[:2], source, strict=False):
+        parts.assert_equal(ours.exclude("collector"), theirs)
+        learn(theirs, policy, normalization)
+    state = source.state()
+    started = descendants(os.getpid()) - before
+    assert any("raylet" in command_of(process) for process in started)
+    source.shutdown()
+    assert all_gone(started)
+
+    again, other, statistics = collect("ray", seed=99)
+    again.set_state(state)
+    other.load_state_dict(policy.state_dict())
+    statistics.load_state_dict(normalization.state_dict())
+    for ours, theirs in zip(expected[2:], again, strict=False):
+        parts.assert_equal(ours.exclude("collector"), theirs)
+        learn(theirs, other, statistics)
+
+
+@pytest.fixture
+def cluster(monkeypatch):
+    """A Ray that is there already; its address and its process."""
+    monkeypatch.setenv("RAY_AUTH_MODE", "disabled")
+    monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        address = f"127.0.0.1:{free.getsockname()[1]}"
+    ray = str(Path(sys.executable).with_name("ray"))
+    port = address.partition(":")[2]
+    options = ["--head", "--block", "--node-ip-address=127.0.0.1", f"--port={port}", "--num-cpus=2"]
+    options.append("--include-dashboard=false")
+    head = subprocess.Popen(
+        [ray, "start", *options],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+    for line in head.stdout:
+        if "Ray runtime started" in line:
+            break
+    yield address, head
+    started = descendants(head.pid)
+    head.terminate()
+    head.communicate()
+    assert all_gone(started)
+
+
+def test_a_cluster_that_is_there_is_joined_and_left_as_it_was(cluster, tmp_path):
+    address, head = cluster
+    joining = ["collector=ray", f"collector.ray_init.address={address}", "collector.num_envs=16"]
+    sizes = ["collector.frames_per_batch=1024", "total_frames=2048", "hydra.run.dir=run"]
+    process = command("train", *SMALL, *joining, *sizes, cwd=tmp_path)
+    workers = set()
+    while process.poll() is None:
+        workers |= {one for one in descendants(head.pid) if "WorkerCollector" in command_of(one)}
+        assert not any("raylet" in command_of(one) for one in descendants(process.pid))
+        time.sleep(0.1)
+    assert process.returncode == 0, process.communicate()[0]
+    assert len(workers) == 2
+    assert all_gone(workers)
+    assert head.poll() is None

@@ -1,0 +1,67 @@
+"""The examples of CONTRIBUTING.md, followed to the letter in a copy of the project."""
+
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+EXAMPLE = re.compile(r"^`(\S+/\S+)`:\n\n```\w+\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+
+
+@pytest.fixture(scope="module")
+def examples() -> dict[str, str]:
+    """What CONTRIBUTING.md shows, by the file that it belongs into."""
+    found = EXAMPLE.finditer((ROOT / "CONTRIBUTING.md").read_text())
+    return {match[1]: match[2] for match in found}
+
+
+@pytest.fixture(scope="module")
+def project(tmp_path_factory, examples) -> Path:
+    """A copy of the project with all examples in it, and nothing else changed."""
+    copy = tmp_path_factory.mktemp("contributed")
+    for name in ("physai", "conf", "tests"):
+        shutil.copytree(ROOT / name, copy / name, ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copy(ROOT / "pyproject.toml", copy)
+    for path, text in examples.items():
+        assert not (copy / path).exists(), f"{path} is there already"
+        (copy / path).write_text(text)
+    return copy
+
+
+def run(project: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([sys.executable, *arguments], cwd=project, capture_output=True, text=True, timeout=240)
+
+
+def test_there_is_an_example_of_everything(examples):
+    assert {str(Path(path).parent) for path in examples} == {
+        "physai/robots/assets",
+        "physai/tasks",
+        "conf/robot",
+        "conf/env",
+        "conf/task",
+        "conf/algo",
+    }
+
+
+@pytest.mark.slow
+def test_the_discovery_tests_pick_up_what_is_added(project):
+    added = "long_arm or long_reacher or hurry or reuse"
+    tests = ("tests/test_config.py", "tests/robots", "tests/tasks", "tests/physics")
+    result = run(project, "-m", "pytest", "-vv", "-p", "no:cacheprovider", "-k", added, *tests)
+    assert result.returncode == 0, result.stdout
+    for name in ("robot@env.robot=long_arm", "env=long_reacher", "task@env.task=hurry", "algo=reuse"):
+        assert re.search(rf"test_every_choice_builds_and_collects\[{re.escape(name)}\] PASSED", result.stdout), name
+    assert "test_kinematics.py" in result.stdout  # robots are also held against PyBullet
+
+
+@pytest.mark.slow
+def test_all_of_it_trains_together(project):
+    tiny = ("total_frames=2048", "collector.num_envs=64", "evaluation.goals=8", "evaluation.episodes=8")
+    choice = ("algo=reuse", "env=long_reacher", "task@env.task=hurry")
+    result = run(project, "-m", "physai.train", *choice, *tiny, "hydra.run.dir=run")
+    assert result.returncode == 0, result.stdout + result.stderr
+    assert (project / "run" / "policy.pt").is_file()

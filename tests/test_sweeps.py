@@ -1,0 +1,139 @@
+"""Sweeps whose jobs run in other processes, and searches that are killed, as a user runs them."""
+
+import csv
+import json
+import os
+import signal
+import subprocess
+import time
+
+import pytest
+
+from tests.training.small import command
+
+# Runs of two iterations, episodes of 20 steps: what is tested is what starts them.
+TINY = (
+    "total_frames=1024",
+    "checkpoint.every_frames=512",
+    "evaluation.every_frames=512",
+    "evaluation.goals=8",
+    "evaluation.episodes=8",
+    "env.task.max_steps=20",
+    "collector.num_envs=16",
+    "collector.frames_per_batch=512",
+    "algo.minibatch_size=128",
+)
+SWEEP = ("-m", *TINY, "hydra.sweep.dir=sweep")
+
+pytestmark = pytest.mark.slow
+
+
+def run(*arguments, cwd):
+    process = command("train", *SWEEP, *arguments, cwd=cwd)
+    output = process.communicate()[0]
+    return process.returncode, output
+
+
+def wait_until(condition, process, seconds=240):
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert process.poll() is None, process.communicate()[0]
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+
+
+def finished(sweep):
+    return {path.parent.name: path.read_bytes() for path in sweep.glob("*/summary.json")}
+
+
+def assert_nothing_is_left_of(group, seconds=30):
+    deadline = time.monotonic() + seconds
+    while True:
+        try:
+            os.killpg(group, 0)
+        except ProcessLookupError:
+            return
+        assert time.monotonic() < deadline, f"a process of group {group} still runs"
+        time.sleep(0.1)
+
+
+def test_joblib_runs_four_seeds_in_two_processes(tmp_path):
+    code, output = run("hydra/launcher=joblib", "hydra.launcher.n_jobs=2", "seed=0,1,2,3", cwd=tmp_path)
+    assert code == 0, output
+    assert sorted(finished(tmp_path / "sweep")) == ["0", "1", "2", "3"]
+    assert [f"[{number}] " in output for number in range(4)] == [True] * 4
+    assert output.index("[3] ") < output.index("differs by")
+    assert "Judging" not in output  # who prints at the same time as others does so to a file of its own
+    assert "Judging" in (tmp_path / "sweep" / "2" / "output.txt").read_text()
+    assert (tmp_path / "sweep" / "training.png").is_file()
+    hashes = {json.loads(summary)["weights_sha256"] for summary in finished(tmp_path / "sweep").values()}
+    assert len(hashes) == 4
+
+
+def test_submitit_s_local_executor_runs_a_sweep_and_a_job_that_fails_is_named(tmp_path):
+    # a rate of 5e38 passes every check and explodes at the first update
+    code, output = run("hydra/launcher=submitit_local", "algo.optimizer.lr=1e-3,5e38", cwd=tmp_path)
+    assert code == 1, output
+    assert sorted(finished(tmp_path / "sweep")) == ["0"]
+    assert "error: sweep/1: iteration 1: the loss is not finite" in output
+    assert "error: 1 of 2 runs failed" in output
+
+
+def test_ray_runs_a_sweep(tmp_path):
+    code, output = run("hydra/launcher=ray", "seed=0,1", cwd=tmp_path)
+    assert code == 0, output
+    assert sorted(finished(tmp_path / "sweep")) == ["0", "1"]
+
+
+@pytest.mark.parametrize(
+    ("launcher", "number"),
+    [
+        (["hydra/launcher=joblib", "hydra.launcher.n_jobs=2"], signal.SIGINT),
+        (["hydra/launcher=submitit_local", "hydra.sweeper.max_batch_size=2"], signal.SIGTERM),
+    ],
+    ids=["joblib", "submitit"],
+)
+def test_a_signal_to_a_parallel_sweep_ends_its_jobs(tmp_path, launcher, number):
+    process = start((*launcher, "seed=0,1", "total_frames=100_000_000"), tmp_path)
+    wait_until(lambda: len(list((tmp_path / "sweep").glob("*/metrics.csv"))) == 2, process)
+    if number == signal.SIGINT:
+        os.killpg(process.pid, number)  # as a terminal does
+    else:
+        process.send_signal(number)
+    output = process.communicate(timeout=60)[0]
+    assert process.returncode == 128 + number, output
+    assert_nothing_is_left_of(process.pid)
+
+
+def start(arguments, cwd):
+    """Start a sweep in a process group of its own."""
+    return command("train", *SWEEP, *arguments, cwd=cwd, start_new_session=True)
+
+
+def test_a_killed_search_goes_on_and_redoes_nothing(tmp_path):
+    search = ("hydra/sweeper=optuna", "hydra.sweeper.n_trials=8")
+    sweep = tmp_path / "sweep"
+    process = start(search, tmp_path)
+    wait_until(lambda: len(finished(sweep)) >= 3 and (sweep / "3" / "metrics.csv").is_file(), process)
+    os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
+    before = finished(sweep)
+    assert 3 <= len(before) < 8
+    code, output = run(*search, cwd=tmp_path)
+    assert code == 0, output
+    after = finished(sweep)
+    assert {name: after[name] for name in before} == before
+    assert len(after) == 8
+    with open(sweep / "study.csv", newline="") as file:
+        trials = list(csv.DictReader(file))
+    assert [trial["state"] for trial in trials].count("complete") == 8
+    for trial in trials:
+        if trial["state"] == "complete":
+            assert float(trial["success rate"]) == json.loads(after[trial["run"]])["success_rate"]
+    names = [key for key in trials[0] if key.startswith("algo.")]
+    assert len({tuple(trial[key] for key in names) for trial in trials}) == 8  # what was killed is tried again
+    assert "the best of 8 trials" in output
+    assert (sweep / "study.png").read_bytes().startswith(b"\x89PNG")
+    again = subprocess.run(process.args, cwd=tmp_path, capture_output=True, text=True)
+    assert "8 trials are done, 0 are left" in again.stdout
+    assert finished(sweep) == after

@@ -1,0 +1,78 @@
+"""Training from a replay buffer: random actions first, and going on from any moment bit for bit, buffer included."""
+
+import json
+import shutil
+import signal
+import time
+
+import pytest
+import torch
+
+from physai.training.agent import Agent
+from physai.training.loop import train
+from tests.training.small import SMALL, command, metrics, small_config
+
+OFF_POLICY = (
+    "algo=sac",
+    *SMALL,
+    "total_frames=8192",
+    "checkpoint.every_frames=1024",
+    "checkpoint.keep=10",
+    "algo.warmup_frames=2048",
+    "algo.frames_per_update=64",
+    "algo.buffer.storage.max_size=3072",  # of which the run goes round twice
+)
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("off_policy")
+    agent, _ = train(small_config(*OFF_POLICY), folder, resume=False)
+    agent.close()
+    return folder, agent.weights_sha256()
+
+
+def test_the_actions_of_the_warm_up_are_random_and_later_ones_are_the_policys():
+    agent = Agent.build(small_config(*OFF_POLICY))
+    with torch.no_grad():  # a policy that does nothing but one thing
+        agent.actor.network[-1].weight.zero_()
+        agent.actor.network[-1].bias.copy_(torch.tensor([3.0, 3.0, -9.0, -9.0]))
+    batches = iter(agent.collector)
+    actions = [next(batches)["action"].clone() for _ in range(3)]
+    agent.close()
+    for warm_up in actions[:2]:
+        quarters = torch.histc(warm_up, 4, -1.0, 1.0) / warm_up.numel()
+        torch.testing.assert_close(quarters, torch.full((4,), 0.25), rtol=0, atol=0.05)
+    assert actions[2].min() > 0.98
+
+
+@pytest.mark.parametrize("frames", [1024, 2048, 5120])  # in the warm-up, right after it, and when the buffer is full
+def test_it_goes_on_from_any_checkpoint_bit_for_bit(finished, tmp_path, frames):
+    whole, digest = finished
+    shutil.copytree(whole, tmp_path / "run")
+    later = [path for path in (tmp_path / "run" / "checkpoints").glob("0*.pt") if int(path.stem) > frames]
+    assert later
+    for path in later:
+        path.unlink()
+    agent, _ = train(small_config(*OFF_POLICY), tmp_path / "run", resume=True)
+    agent.close()
+    assert agent.weights_sha256() == digest
+    assert metrics(tmp_path / "run") == metrics(whole)
+    assert (tmp_path / "run" / "episodes.csv").read_bytes() == (whole / "episodes.csv").read_bytes()
+
+
+@pytest.mark.slow
+def test_killed_and_resumed_it_ends_like_the_uninterrupted_run(finished, tmp_path):
+    process = command("train", *OFF_POLICY, "hydra.run.dir=run", cwd=tmp_path)
+    while not (tmp_path / "run" / "metrics.csv").is_file() or len(metrics(tmp_path / "run")) < 4:
+        assert process.poll() is None
+        time.sleep(0.01)
+    process.send_signal(signal.SIGKILL)
+    assert process.wait() == -signal.SIGKILL
+    process = command("train", "resume=run", cwd=tmp_path)
+    output = process.communicate()[0]
+    assert process.returncode == 0, output
+    whole, digest = finished
+    assert json.loads((tmp_path / "run" / "summary.json").read_text())["weights_sha256"] == digest
+    assert metrics(tmp_path / "run") == metrics(whole)
+    assert (tmp_path / "run" / "episodes.csv").read_bytes() == (whole / "episodes.csv").read_bytes()

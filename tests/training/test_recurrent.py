@@ -1,0 +1,75 @@
+"""Training a policy that remembers: its own ratio is one, and it goes on from any moment bit for bit."""
+
+import json
+import signal
+import time
+
+import pytest
+import torch
+
+from physai.training.agent import Agent
+from physai.training.loop import train
+from tests.training.small import SMALL, command, metrics, small_config
+
+RECURRENT = ("policy=gru", *SMALL, "collector.num_envs=64", "total_frames=8192")  # sequences of 16 steps
+
+
+def test_collected_sequences_have_the_probabilities_that_learning_starts_from():
+    agent = Agent.build(small_config("policy=gru", "env.task.max_steps=23", "randomization=strong"))
+    batches = iter(agent.collector)
+    next(batches)
+    batch = next(batches)
+    agent.close()
+    begins = batch["episode_length"][..., 0] == 0
+    assert begins[:, 1:].sum() > 32  # in the middle of sequences
+    assert batch["memory"][:, 0].abs().max() > 0.1  # what was remembered of the batch before
+    with torch.no_grad():
+        log_prob = agent.actor.get_dist(batch).log_prob(batch["latent_action"])
+    torch.testing.assert_close(log_prob, batch["action_log_prob"], rtol=0, atol=1e-5)
+
+
+def test_it_learns_from_whole_sequences_each_once_an_epoch(monkeypatch):
+    agent = Agent.build(small_config("policy=gru", "algo.epochs=2", "algo.minibatch_size=300"))
+    seen, loss = [], agent.algorithm.descent.loss
+    forward = loss.forward
+    monkeypatch.setattr(
+        loss, "forward", lambda minibatch: seen.append(minibatch["latent_action"]) or forward(minibatch)
+    )
+    batch = next(iter(agent.collector))
+    agent.algorithm.update(batch)
+    agent.close()
+    assert [tuple(minibatch.shape) for minibatch in seen] == [(4, 64, 2)] * 8  # 300 samples are four sequences and some
+    epochs = [torch.cat(seen[:4]), torch.cat(seen[4:])]
+    for epoch in epochs:
+        rows = [int((batch["latent_action"] == sequence).flatten(1).all(1).nonzero()) for sequence in epoch]
+        assert sorted(rows) == list(range(16))
+    assert not torch.equal(*epochs)
+
+
+def test_one_seed_gives_one_run(tmp_path):
+    hashes = []
+    for name in ("one", "two"):
+        (tmp_path / name).mkdir()
+        agent, _ = train(small_config(*RECURRENT, "total_frames=4096"), tmp_path / name, resume=False)
+        agent.close()
+        hashes.append(agent.weights_sha256())
+    assert hashes[0] == hashes[1]
+
+
+@pytest.mark.slow
+def test_killed_and_resumed_it_ends_like_the_uninterrupted_run(tmp_path):
+    for name, kill in (("whole", False), ("killed", True)):
+        process = command("train", *RECURRENT, f"hydra.run.dir={name}", cwd=tmp_path)
+        if kill:
+            while not (tmp_path / name / "metrics.csv").is_file() or len(metrics(tmp_path / name)) < 5:
+                assert process.poll() is None
+                time.sleep(0.01)
+            process.send_signal(signal.SIGKILL)
+            assert process.wait() == -signal.SIGKILL
+            process = command("train", f"resume={name}", cwd=tmp_path)
+        output = process.communicate()[0]
+        assert process.returncode == 0, output
+    whole, killed = (json.loads((tmp_path / name / "summary.json").read_text()) for name in ("whole", "killed"))
+    assert killed["weights_sha256"] == whole["weights_sha256"]
+    assert metrics(tmp_path / "killed") == metrics(tmp_path / "whole")
+    assert (tmp_path / "killed" / "episodes.csv").read_bytes() == (tmp_path / "whole" / "episodes.csv").read_bytes()
