@@ -25,7 +25,7 @@ TINY = (
 )
 SWEEP = ("-m", *TINY, "hydra.sweep.dir=sweep")
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]  # a busy machine is no fault of a test
 
 
 def run(*arguments, cwd):

@@ -21,6 +21,7 @@ PARTS = {
     "collection": "collection by one process and by two, against a bare PyBullet loop; and by each collector",
     "update": "learning from a batch, against PPO written by hand",
     "training": "time to 99 percent of unseen goals, against Stable-Baselines3 PPO",
+    "algorithms": "time to 95 percent of unseen goals of every algorithm, against Stable-Baselines3's of the same name",
     "growth": "time and memory of training against frames and robots",
 }
 NEEDS = {  # the extra that a part needs, and its modules
@@ -28,6 +29,7 @@ NEEDS = {  # the extra that a part needs, and its modules
     "ros": ("ros", ["rclpy"]),
     "gym": ("bench", ["stable_baselines3"]),
     "training": ("bench", ["stable_baselines3"]),
+    "algorithms": ("bench", ["stable_baselines3"]),
     "collection": ("ray", ["ray"]),
 }
 
@@ -61,12 +63,14 @@ def _options() -> argparse.Namespace:
     parser.add_argument("--seeds", type=int, default=5, help="train so often, with seeds counting up (5)")
     sb3_frames = "where Stable-Baselines3 gives up; what physai is ahead by is then a lower bound (1,000,000)"
     parser.add_argument("--sb3-frames", type=int, default=1_000_000, help=sb3_frames)
+    sb3_seconds = "when each algorithm of Stable-Baselines3 gives up in --algorithms (300)"
+    parser.add_argument("--sb3-seconds", type=float, default=300.0, help=sb3_seconds)
     figure = Path("outputs/growth.png")
     parser.add_argument("--figure", type=Path, default=figure, help=f"where --growth draws ({figure})")
     options = parser.parse_args()
     options.parts = options.parts or list(PARTS)
-    if options.seed < 0 or options.seeds < 1 or options.sb3_frames < 1:
-        parser.error("--seed must not be negative, --seeds and --sb3-frames must be positive")
+    if options.seed < 0 or options.seeds < 1 or min(options.sb3_frames, options.sb3_seconds) <= 0:
+        parser.error("--seed must not be negative, --seeds, --sb3-frames and --sb3-seconds must be positive")
     return options
 
 

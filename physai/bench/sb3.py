@@ -1,4 +1,4 @@
-"""Stable-Baselines3's PPO: as it comes, and as fast as we could make it on our robots."""
+"""Stable-Baselines3: its algorithms as they come, and PPO as fast as we could make it on our robots."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -10,7 +10,8 @@ import numpy as np
 import torch
 from gymnasium import spaces
 from numpy.typing import NDArray
-from stable_baselines3 import PPO
+from stable_baselines3 import A2C, DDPG, PPO, SAC, TD3
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
@@ -108,18 +109,22 @@ class RobotVecEnv(VecEnv):
 
 @dataclass(frozen=True)
 class Settings:
-    """Which env, and what PPO takes.
+    """Which env, which algorithm, and what it takes.
 
     Attributes:
         make_envs: Makes the env.
-        ppo: PPO's arguments.
+        arguments: The algorithm's; its ``learning_rate`` among them.
+        algorithm: Its class.
+        frames: Learned at a time; an on-policy algorithm rounds up to a batch.
         features: Whether the policy is told the task's features, too, as physai's is; this is more than a setting.
         horizon: Frames until the learning rate has fallen to its end; 0 leaves it as it is.
-        trial: PPO's arguments for the choice of threads, where a batch takes long.
+        trial: Arguments for the choice of threads, where a batch takes long.
     """
 
     make_envs: Callable[[], VecEnv]
-    ppo: dict[str, Any]
+    arguments: dict[str, Any]
+    algorithm: type[BaseAlgorithm] = PPO
+    frames: int = 1
     features: bool = False
     horizon: int = 0
     trial: dict[str, Any] = field(default_factory=dict)
@@ -165,38 +170,52 @@ TUNED = Settings(partial(_our_envs, 256, features=False), _TUNED, horizon=1_000_
 TUNED_WITH_FEATURES = Settings(partial(_our_envs, 256, features=True), _TUNED, features=True, horizon=200_000)
 
 
+def as_it_comes(algorithm: str) -> Settings:
+    """The settings that an algorithm has by itself, on as many envs as its documentation's examples have."""
+    if algorithm == "ppo":
+        return DEFAULTS
+    kinds: dict[str, tuple[type[BaseAlgorithm], float, int]] = {  # their default learning rates
+        "a2c": (A2C, 7e-4, 4),
+        "sac": (SAC, 3e-4, 1),
+        "td3": (TD3, 1e-3, 1),
+        "ddpg": (DDPG, 1e-3, 1),
+    }
+    kind, rate, envs = kinds[algorithm]
+    return Settings(partial(make_vec_env, "physai/Reacher-v0", envs), {"learning_rate": rate}, kind, frames=1024)
+
+
 class Learner:
-    """PPO, one batch at a time.
+    """An algorithm, some frames at a time.
 
     Args:
         settings: What it is like.
         seed: Of weights, exploration, minibatches and goals.
         threads: Of torch.
-        changed: PPO's arguments that differ.
+        changed: Arguments that differ.
     """
 
     def __init__(self, settings: Settings, seed: int, threads: int = 1, **changed: Any) -> None:
         self.in_keys = ["observation", "features"] if settings.features else ["observation"]
         self._envs = settings.make_envs()
-        self._horizon, self._threads, self._frames = settings.horizon, threads, 0
-        arguments = settings.ppo | changed
+        self._horizon, self._threads, self._frames, self._at_a_time = settings.horizon, threads, 0, settings.frames
+        arguments = settings.arguments | changed
         self._rate = arguments["learning_rate"]
         # Torch would check the arguments of every distribution, at every step.
         torch.distributions.Distribution.set_default_validate_args(False)
         arguments["learning_rate"] = self._learning_rate
-        self.model = PPO("MlpPolicy", self._envs, seed=seed, device="cpu", **arguments)
+        self.model = settings.algorithm("MlpPolicy", self._envs, seed=seed, device="cpu", **arguments)
         self.model.set_logger(Logger(None, []))
 
     def _learning_rate(self, _: float) -> float:
-        # What PPO says of its progress refers to one call of learn(), and each makes one batch here.
+        # What it says of its progress refers to one call of learn(), of which there are many here.
         left = 1.0 - self._frames / self._horizon if self._horizon else 1.0
         return float(self._rate * max(SLOWEST_RATE, left))
 
     def learn(self) -> int:
-        """Collect a batch and learn from it; returns its frames."""
+        """Collect and learn; returns the frames."""
         torch.set_num_threads(self._threads)
         before = self._frames
-        self.model.learn(1, reset_num_timesteps=False)  # rounds up to one batch
+        self.model.learn(self._at_a_time, reset_num_timesteps=False)
         self._frames = self.model.num_timesteps
         return self._frames - before
 

@@ -1,5 +1,6 @@
 """How soon a policy is trained, against Stable-Baselines3."""
 
+import math
 from argparse import Namespace
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -26,6 +27,7 @@ class Race:
     """How a learner fared; its clock counts learning alone, not building and not judging."""
 
     name: str
+    target: float = TARGET
     frames: int = 0
     seconds: float = 0.0
     success_rate: float = 0.0
@@ -38,20 +40,26 @@ class Race:
     @property
     def won(self) -> bool:
         """Whether the target was reached."""
-        return self.success_rate >= TARGET
+        return self.success_rate >= self.target
 
 
-def run_race(name: str, learn: Callable[[], int], judge: Callable[[], float], max_frames: int) -> Race:
-    """Learn until a judgement finds the target reached, or until ``max_frames``.
+def run_race(
+    race: Race,
+    learn: Callable[[], int],
+    judge: Callable[[], float],
+    max_frames: float = math.inf,
+    max_seconds: float = math.inf,
+) -> Race:
+    """Learn until a judgement finds the target reached, or until it takes too long; return the race.
 
     Args:
-        name: The learner's.
+        race: At its start.
         learn: One iteration of collecting and learning; returns its frames.
         judge: Returns the success rate of the policy as it is.
         max_frames: Where to give up.
+        max_seconds: When to give up.
     """
-    race = Race(name)
-    while not race.won and race.frames < max_frames:
+    while not race.won and race.frames < max_frames and race.seconds < max_seconds:
         due = min(race.frames + JUDGE_EVERY, max_frames)
         while race.frames < due:
             frames, seconds = timed(learn)
@@ -59,7 +67,7 @@ def run_race(name: str, learn: Callable[[], int], judge: Callable[[], float], ma
             race.seconds += seconds
         race.success_rate = judge()
         print(
-            f"{name}: {race.frames:>9,} frames  {race.seconds:6.1f} s  {race.frames_per_second:>6,.0f}/s  "
+            f"{race.name}: {race.frames:>9,} frames  {race.seconds:6.1f} s  {race.frames_per_second:>6,.0f}/s  "
             f"success {race.success_rate:6.1%}",
             flush=True,
         )
@@ -90,17 +98,21 @@ def measure_training(seed: int, seeds: int, sb3_frames: int) -> dict[str, list[R
     )
     judge = make_evaluation_env(configs[0], configs[0].randomization, GOALS, GOALS_SEED)
     try:
-        races = {"physai": [_race_physai(config, judge) for config in configs]}
+        races = {"physai": [race_physai(config, Race(f"physai, seed {config.seed}"), judge) for config in configs]}
         for name, settings, count in sides:
             threads, end = sb3.fastest_threads(name, settings), min(sb3_frames, settings.horizon or sb3_frames)
             learners = (sb3.Learner(settings, one, threads) for one in range(seed, seed + count))
-            races[name] = [_race_sb3(f"{name}, seed {seed + n}", x, judge, end) for n, x in enumerate(learners)]
+            races[name] = [
+                race_sb3(learner, Race(f"{name}, seed {seed + n}"), judge, max_frames=end)
+                for n, learner in enumerate(learners)
+            ]
         return races
     finally:
         judge.close()
 
 
-def _race_physai(config: TrainConfig, judge: TransformedRobotEnv) -> Race:
+def race_physai(config: TrainConfig, race: Race, judge: TransformedRobotEnv) -> Race:
+    """Let physai learn by a config until the judge's goals are reached, or until its ``total_frames``."""
     agent = Agent.build(config)
     batches = iter(agent.collector)
 
@@ -115,19 +127,20 @@ def _race_physai(config: TrainConfig, judge: TransformedRobotEnv) -> Race:
         return evaluate(agent.actor, judge, GOALS, GOALS_SEED).success_rate
 
     try:
-        return run_race(f"physai, seed {config.seed}", learn, success_rate, config.total_frames)
+        return run_race(race, learn, success_rate, max_frames=config.total_frames)
     finally:
         agent.close()
 
 
-def _race_sb3(name: str, learner: sb3.Learner, judge: TransformedRobotEnv, max_frames: int) -> Race:
+def race_sb3(learner: sb3.Learner, race: Race, judge: TransformedRobotEnv, **limits: float) -> Race:
+    """Let Stable-Baselines3 learn until the judge's goals are reached, or until a limit of ``run_race``."""
     policy = TensorDictModule(learner.act, in_keys=learner.in_keys, out_keys=["action"])
 
     def success_rate() -> float:
         return evaluate(policy, judge, GOALS, GOALS_SEED).success_rate
 
     try:
-        return run_race(name, learner.learn, success_rate, max_frames)
+        return run_race(race, learner.learn, success_rate, **limits)
     finally:
         learner.close()
 

@@ -2,6 +2,7 @@
 
 from argparse import Namespace
 from collections.abc import Callable
+from typing import Any
 
 import torch
 from rich.table import Table
@@ -37,7 +38,7 @@ def _update_speeds(seed: int, minibatch: int) -> list[float]:
     try:
         batch = next(iter(agent.collector))
         agent.env.normalization.update(batch.get("observation"))
-        by_hand = plain_ppo(twin, batch, minibatch, config.algo["optimizer"]["lr"])
+        by_hand = plain_ppo(twin, batch, config.algo)
 
         def update() -> int:
             agent.algorithm.update(batch.copy())
@@ -49,21 +50,20 @@ def _update_speeds(seed: int, minibatch: int) -> list[float]:
         twin.close()
 
 
-def plain_ppo(agent: Agent, batch: TensorDictBase, minibatch: int, lr: float) -> Callable[[], int]:
+def plain_ppo(agent: Agent, batch: TensorDictBase, algo: dict[str, Any]) -> Callable[[], int]:
     """PPO as one writes it for one task: the same networks, numbers and samples, in as little torch as it takes.
 
     Args:
         agent: Its networks learn.
         batch: Frames [N, T].
-        minibatch: Samples a step.
-        lr: Learning rate.
+        algo: The numbers of ``conf/algo/ppo.yaml``.
 
     Returns:
         A function that learns from the batch once, and says from how many samples, epochs counted.
     """
-    actor, critic, config = agent.actor, agent.critic, agent.algorithm
-    gamma, lmbda = float(config.advantage.gamma), float(config.advantage.lmbda)
-    clip, critic_coeff = float(config.loss.clip_epsilon), float(config.loss.critic_coeff)
+    actor, critic = agent.actor, agent.critic
+    gamma, lmbda, lr = algo["advantage"]["gamma"], algo["advantage"]["lmbda"], algo["optimizer"]["lr"]
+    clip, critic_coeff = algo["loss"]["clip_epsilon"], algo["loss"]["critic_coeff"]
     parameters = [*actor.parameters(), *critic.parameters()]
     optimizer = torch.optim.Adam(parameters, lr=lr, eps=1e-5, fused=True)
 
@@ -86,8 +86,8 @@ def plain_ppo(agent: Agent, batch: TensorDictBase, minibatch: int, lr: float) ->
             seen = inputs(batch)
             columns = [seen, batch.get("latent_action"), batch.get("action_log_prob"), *advantages(seen)]
         frames = [column.flatten(0, 1) for column in columns]
-        for _ in range(config.epochs):
-            for rows in torch.randperm(batch.numel()).split(minibatch):
+        for _ in range(algo["epochs"]):
+            for rows in torch.randperm(batch.numel()).split(algo["minibatch_size"]):
                 seen, latent, old, advantage, target = (column[rows] for column in frames)
                 advantage = (advantage - advantage.mean()) / (advantage.std() + 1e-8)
                 normal = torch.distributions.Normal(actor.network(seen), actor.log_std.exp(), validate_args=False)
@@ -96,9 +96,9 @@ def plain_ppo(agent: Agent, batch: TensorDictBase, minibatch: int, lr: float) ->
                 error = (critic.network(seen)[..., 0] - target).square().mean()
                 optimizer.zero_grad()
                 (critic_coeff * error - gain).backward()
-                nn.utils.clip_grad_norm_(parameters, config.max_grad_norm)
+                nn.utils.clip_grad_norm_(parameters, algo["max_grad_norm"])
                 optimizer.step()
-        return config.epochs * batch.numel()
+        return int(algo["epochs"]) * batch.numel()
 
     return update
 

@@ -7,6 +7,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
+from multiprocessing import connection
 from typing import Any
 
 import torch
@@ -92,6 +93,7 @@ class RobotMultiCollector(MultiCollector):
             raise UserError(str(error).partition("\n")[0]) from error
         except (RuntimeError, ValueError, OSError, EOFError) as error:
             open_ones = [process for process in getattr(self, "procs", []) if not process._closed]
+            connection.wait([process.sentinel for process in open_ones], timeout=1)  # a broken pipe is a moment ahead
             codes = [str(process.exitcode) for process in open_ones if process.exitcode is not None]
             for process in open_ones:
                 process.kill()

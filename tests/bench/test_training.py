@@ -131,7 +131,7 @@ def test_stable_baselines3_learns_batch_by_batch(name):
     assert after.shape == (3, 2)
     assert not torch.equal(before, after)
     left = 1 - frames / settings.horizon if settings.horizon else 1.0  # the second batch's
-    assert model.policy.optimizer.param_groups[0]["lr"] == pytest.approx(settings.ppo["learning_rate"] * left)
+    assert model.policy.optimizer.param_groups[0]["lr"] == pytest.approx(settings.arguments["learning_rate"] * left)
     learner.close()
 
 
@@ -172,7 +172,7 @@ def test_all_learners_race(monkeypatch):
     quick = {"n_steps": 16, "batch_size": 64, "n_epochs": 1}
     for name in ("DEFAULTS", "TUNED", "TUNED_WITH_FEATURES"):
         settings = getattr(sb3, name)
-        monkeypatch.setattr(sb3, name, replace(settings, ppo=settings.ppo | quick, trial={}))
+        monkeypatch.setattr(sb3, name, replace(settings, arguments=settings.arguments | quick, trial={}))
     sides = training.measure_training(seed=0, seeds=2, sb3_frames=2048)
     assert [len(races) for races in sides.values()] == [2, 2, 2, 1]
     for name, races in sides.items():

@@ -16,7 +16,7 @@ def test_ppo_by_hand_learns_what_algo_ppo_learns():
     batch = next(iter(agent.collector))
     agent.env.normalization.update(batch["observation"])
     before = [value.clone() for value in agent.actor.parameters()]
-    frames = update.plain_ppo(twin, batch.clone(), 512, lr=config.algo["optimizer"]["lr"])()
+    frames = update.plain_ppo(twin, batch.clone(), config.algo)()
     agent.algorithm.update(batch)
     assert frames == 512 * config.algo["epochs"]
     for ours, by_hand, untrained in zip(agent.actor.parameters(), twin.actor.parameters(), before, strict=True):
