@@ -4,5 +4,14 @@ from physai.algorithms.interface import Algorithm, Networks, NonFiniteError
 from physai.algorithms.off_policy import OffPolicy
 from physai.algorithms.on_policy import OnPolicy
 from physai.algorithms.ppo_loss import FusedClipPPOLoss
+from physai.algorithms.proportional import ProportionalSampler
 
-__all__ = ["Algorithm", "FusedClipPPOLoss", "Networks", "NonFiniteError", "OffPolicy", "OnPolicy"]
+__all__ = [
+    "Algorithm",
+    "FusedClipPPOLoss",
+    "Networks",
+    "NonFiniteError",
+    "OffPolicy",
+    "OnPolicy",
+    "ProportionalSampler",
+]

@@ -9,12 +9,13 @@ from torch import Tensor
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LRScheduler
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
-from torchrl.data.replay_buffers import PrioritizedSampler, RandomSampler
+from torchrl.data.replay_buffers import RandomSampler
 from torchrl.objectives import TargetNetUpdater, TD3Loss
 from torchrl.objectives.utils import ValueEstimators
 
 from physai.algorithms.descent import Descent, check_ranges
 from physai.algorithms.interface import Networks
+from physai.algorithms.proportional import ProportionalSampler
 from physai.config import Count, NonNegativeFloat, PositiveFloat
 from physai.errors import UserError
 
@@ -33,7 +34,7 @@ class OffPolicy:
         frames_per_batch: Size of the batches to come.
         loss: Makes the loss module from the actor and the critic; all its ``loss_*`` outputs are summed.
         gamma: Discount factor.
-        buffer: Replay buffer on LazyTensorStorage or LazyMemmapStorage, with RandomSampler or PrioritizedSampler.
+        buffer: Replay buffer on LazyTensorStorage or LazyMemmapStorage, with RandomSampler or ProportionalSampler.
         minibatch_size: Samples of a gradient step.
         optimizer: Makes the optimizer from the parameters.
         scheduler: Makes the learning-rate schedule from the optimizer; it steps once a batch. None keeps the rate.
@@ -130,8 +131,7 @@ class OffPolicy:
                 figures.set("grad_norm", torch.zeros(()))
             results.append(figures)
             priorities.append(minibatch.get("td_error").detach())
-        if isinstance(self.buffer.sampler, PrioritizedSampler):
-            self.buffer.update_priority(drawn.get("index"), torch.cat(priorities))
+        self.buffer.update_priority(drawn.get("index"), torch.cat(priorities))
         means: TensorDictBase = torch.stack(results).mean(dim=0)
         return {key: float(value) for key, value in means.items()} | {"lr": self.descent.end_batch()}
 
@@ -141,18 +141,15 @@ class OffPolicy:
 
     def state(self) -> dict[str, Any]:
         """Return what ``set_state`` needs to go on bit for bit: all frames in the buffer, too."""
-        held, sampler = len(self.buffer), self.buffer.sampler
+        held = len(self.buffer)
         frames = self.buffer.storage.get(range(held)) if held else TensorDict({}, [0])
-        priorities = None
-        if held and isinstance(sampler, PrioritizedSampler):
-            priorities = torch.as_tensor(sampler._sum_tree[torch.arange(held)]), sampler._max_priority
         return {
             **self.descent.state(),
             "frames": {".".join(key): frames.get(key).clone() for key in self._keys} if held else {},
             "cursor": self.buffer.writer._cursor,
             "seen": self._seen,
             "steps": self._steps,
-            "priorities": priorities,
+            "sampler": self.buffer.sampler.state_dict(),
             "generator": self._generator.get_state(),
         }
 
@@ -166,21 +163,17 @@ class OffPolicy:
                 held.set(tuple(name.split(".")), values)
             self.buffer.extend(held)
         self.buffer.writer._cursor = state["cursor"]
-        if state["priorities"] is not None:
-            sampler = self.buffer.sampler
-            leaves, sampler._max_priority = state["priorities"]
-            sampler._sum_tree[torch.arange(len(leaves))] = leaves
-            sampler._min_tree[torch.arange(len(leaves))] = leaves
+        self.buffer.sampler.load_state_dict(state["sampler"])
         self._seen, self._steps = state["seen"], state["steps"]
         self._generator.set_state(state["generator"])
 
 
 def _check_buffer(buffer: TensorDictReplayBuffer, frames_per_batch: int) -> None:
     storage, sampler = buffer.storage, buffer.sampler
-    if not isinstance(storage, LazyTensorStorage) or type(sampler) not in (RandomSampler, PrioritizedSampler):
+    if not isinstance(storage, LazyTensorStorage) or type(sampler) not in (RandomSampler, ProportionalSampler):
         raise UserError(
             "algo.buffer: storage must be a LazyTensorStorage or LazyMemmapStorage, and sampler a RandomSampler or "
-            f"PrioritizedSampler, got {type(storage).__name__} and {type(sampler).__name__}"
+            f"ProportionalSampler, got {type(storage).__name__} and {type(sampler).__name__}"
         )
     if buffer.batch_size is not None:
         raise UserError("algo.buffer.batch_size: leave it out; minibatches are algo.minibatch_size")
@@ -188,11 +181,6 @@ def _check_buffer(buffer: TensorDictReplayBuffer, frames_per_batch: int) -> None
         raise UserError(
             f"algo.buffer.storage.max_size: a batch, collector.frames_per_batch={frames_per_batch}, "
             f"does not fit into {storage.max_size}"
-        )
-    if isinstance(sampler, PrioritizedSampler) and sampler.max_size < storage.max_size:
-        raise UserError(
-            f"algo.buffer.sampler.max_capacity ({sampler.max_size}) must be "
-            f"algo.buffer.storage.max_size ({storage.max_size})"
         )
 
 

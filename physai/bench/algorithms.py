@@ -43,7 +43,7 @@ def measure_algorithms(seed: int, sb3_seconds: float) -> dict[str, tuple[Race, R
 
 def algorithms_table(races: dict[str, tuple[Race, Race]]) -> Table:
     """Show frames and seconds of both, and what physai is ahead by."""
-    title = f"Training until {TARGET:.0%} of {GOALS:,} unseen goals are reached: physai / Stable-Baselines3, as they come"
+    title = f"Training until {TARGET:.0%} of {GOALS:,} unseen goals are reached: physai / SB3, as they come"
     shown = table(title, "algorithm", "frames", "time", "success", "ahead by")
     for name, (ours, theirs) in races.items():
         more = "" if theirs.won else "> "

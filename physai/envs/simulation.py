@@ -134,9 +134,7 @@ class Simulation:
             dynamics = self.layout.dynamics(new)
         self.physics.reset(index, start, np.zeros_like(start), dynamics)
 
-    def step(
-        self, action: np.ndarray, restart: np.ndarray | None = None
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def step(self, action: np.ndarray, restart: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Apply actions [N, n] in [-1, 1] for one control period.
 
         Args:

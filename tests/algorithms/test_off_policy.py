@@ -7,7 +7,6 @@ import math
 import pytest
 import torch
 from tensordict import TensorDict
-from torchrl.data.replay_buffers import PrioritizedSampler
 
 from physai.algorithms import NonFiniteError
 from physai.config import compose
@@ -29,23 +28,10 @@ SMALL = (
 )
 composed = functools.cache(lambda *overrides: compose("train", overrides).algo)
 PRIORITIZED = (
-    "algo.buffer.sampler._target_=torchrl.data.replay_buffers.PrioritizedSampler",
-    "+algo.buffer.sampler={max_capacity:96,alpha:0.7,beta:0.5}",
+    "algo.buffer.sampler._target_=physai.algorithms.ProportionalSampler",
+    "+algo.buffer.sampler={alpha:0.7,beta:0.5}",
 )
 ON_DISK = ("algo.buffer.storage._target_=torchrl.data.LazyMemmapStorage",)
-
-
-def _compiled_sampler():
-    try:
-        PrioritizedSampler(1, 0.7, 0.5)
-    except RuntimeError:
-        return False
-    return True
-
-
-needs_compiled_sampler = pytest.mark.skipif(
-    not _compiled_sampler(), reason="TorchRL's compiled part is built for another version of PyTorch"
-)
 
 
 def build(name, *overrides, actor=None, critic=None, normalizer=None, seed=0):
@@ -239,9 +225,7 @@ def test_the_temperature_falls_while_the_policy_is_more_random_than_it_has_to_be
     assert temperatures[-1] < 0.195
 
 
-@pytest.mark.parametrize(
-    "swap", [(), ON_DISK, pytest.param(PRIORITIZED, marks=needs_compiled_sampler)], ids=["ram", "disk", "prio"]
-)
+@pytest.mark.parametrize("swap", [(), ON_DISK, PRIORITIZED], ids=["ram", "disk", "prio"])
 @pytest.mark.parametrize("name", ALGORITHMS)
 @pytest.mark.parametrize("batches", [0, 2, 5])  # wrapped around after the third
 def test_a_saved_state_continues_bit_for_bit(name, swap, batches, tmp_path):
@@ -272,7 +256,6 @@ def test_a_state_holds_the_frames_that_there_are_and_no_more(tmp_path):
     assert (tmp_path / "state.pt").stat().st_size < 50_000
 
 
-@needs_compiled_sampler
 def test_surprising_frames_are_drawn_more_often_and_count_less():
     rewards = torch.zeros(4, 8, 1)
     rewards[2, 3] = 3.0  # frame 19
@@ -326,12 +309,6 @@ def test_parts_that_do_not_go_together_are_refused_in_one_line(overrides, messag
     with pytest.raises(UserError, match=message) as refused:
         Agent.build(small_config(*small, *overrides))
     assert "\n" not in str(refused.value)
-
-
-@needs_compiled_sampler
-def test_a_prioritized_sampler_smaller_than_the_buffer_is_refused():
-    with pytest.raises(UserError, match=r"max_capacity \(96\) must be .*max_size \(97\)"):
-        build("sac", *PRIORITIZED, "algo.buffer.storage.max_size=97")
 
 
 def test_a_privileged_critic_of_sac_judges_what_comes_after_a_frame_too():
