@@ -73,14 +73,15 @@ def export_policy(
         report("TorchScript, also in a fresh process", "equal to the last bit")
 
         converted = onnx.convert(policy, states) if "onnx" in formats else None
+        tolerance = gate.onnx_tolerance(policy, expected, states)
         if converted is not None:
-            worst = gate.check_onnx(onnx.Runtime(converted), expected, states)
+            worst = gate.check_onnx(onnx.Runtime(converted), expected, states, tolerance)
             report("ONNX in ONNX Runtime", f"within {worst:.1e} rad/s")
 
         if policy.memory_size:
             forms: dict[str, tuple[gate.Function, float]] = {"the artifact": (policy, 0.0), "the file": (loaded, 0.0)}
             if converted is not None:
-                forms["ONNX Runtime"] = (onnx.Runtime(converted), gate.ONNX_TOLERANCE)
+                forms["ONNX Runtime"] = (onnx.Runtime(converted), tolerance)
             worst = gate.check_recurrence(forms, gate.acting(actor, env), work)
             others = f", ONNX within {worst:.1e}" if converted is not None else ""
             report("remembers as the policy does", f"over {len(rollout):,} steps: to the last bit{others}")
@@ -104,7 +105,7 @@ def export_policy(
         gate.check_metadata(metadata, env.simulation, expected)
         if converted is not None:
             final_onnx = onnx.describe(converted, text)
-            gate.check_onnx(onnx.Runtime(final_onnx), expected, states)
+            gate.check_onnx(onnx.Runtime(final_onnx), expected, states, tolerance)
             if onnx.read_metadata(final_onnx) != text:
                 raise gate.GateError("the metadata of the ONNX file is not that of the policy")
             write(run_dir / FILES["onnx"], final_onnx)

@@ -177,15 +177,15 @@ class Simulation:
         """
         fastest = self.config.max_velocity
         command = [min(max(share, -1.0), 1.0) * fastest for share in action.tolist()]
-        joint_position, joint_velocity = self.physics.step(np.array([command]))
-        (position,), (velocity,), (goal,) = joint_position.tolist(), joint_velocity.tolist(), self.goal.tolist()
+        position, velocity = self.physics.step_one(command)
+        (goal,) = self.goal.tolist()
         tip = self._tip.of_one(position)
         distance = math.dist(tip, goal)
         terminated = self.task.success(distance)
         reward = self.task.reward(distance, terminated)
         length = int(self._episode_length[0][0]) + 1
         episode_return = float(self._episode_return[0][0]) + reward
-        self._joint_position, self._joint_velocity, self._end_effector = joint_position, joint_velocity, [tip]
+        self._joint_position, self._joint_velocity, self._end_effector = [position], [velocity], [tip]
         self._distance, self._episode_length, self._episode_return = [[distance]], [[length]], [[episode_return]]
         observation = np.array(self.task.observe(self._continuous, position, velocity, tip, goal), np.float32)
         truncated = length >= self.task.max_steps and not terminated

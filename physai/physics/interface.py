@@ -51,6 +51,9 @@ class Physics(Protocol):
     def step(self, velocity_command: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Hold a velocity command [N, n], rad/s, for one control period; return joint positions and velocities."""
 
+    def step_one(self, velocity_command: list[float]) -> tuple[list[float], list[float]]:
+        """``step`` of the only robot in plain numbers, n each."""
+
     def joint_state(self) -> tuple[np.ndarray, np.ndarray]:
         """Return joint positions [N, n], rad, and velocities [N, n], rad/s."""
 

@@ -127,8 +127,17 @@ class PyBulletPhysics:
         expected = self.num_robots, len(self._joints)
         if velocity_command.shape != expected:
             raise ValueError(f"commands of shape {expected} are needed, got {velocity_command.shape}")
+        self._advance(velocity_command.ravel().tolist())
+        return self.joint_state()
+
+    def step_one(self, velocity_command: list[float]) -> tuple[list[float], list[float]]:
+        """See :meth:`physai.physics.Physics.step_one`."""
+        self._advance(velocity_command)
+        return self._position, self._velocity
+
+    def _advance(self, velocity_command: list[float]) -> None:
         # One flat pass over all joints of all robots: this loop is what collection costs most.
-        commands = zip(self._motors, velocity_command.ravel().tolist(), self._velocity, strict=True)
+        commands = zip(self._motors, velocity_command, self._velocity, strict=True)
         command, step, read = bullet.setJointMotorControl2, bullet.stepSimulation, bullet.getJointStates
         mode, joints = bullet.VELOCITY_CONTROL, self._joints
         positions: list[float] = []
@@ -146,7 +155,6 @@ class PyBulletPhysics:
                     positions.append(position)
                     velocities.append(velocity)
         self._position, self._velocity = positions, velocities
-        return self.joint_state()
 
     def joint_state(self) -> tuple[np.ndarray, np.ndarray]:
         """See :meth:`physai.physics.Physics.joint_state`."""

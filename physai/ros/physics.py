@@ -153,6 +153,11 @@ class RosPhysics:
             raise
         return self.joint_state()
 
+    def step_one(self, velocity_command: list[float]) -> tuple[list[float], list[float]]:
+        """See :meth:`physai.physics.Physics.step_one`, and ``step``."""
+        position, velocity = self.step(np.array([velocity_command]))
+        return position[0].tolist(), velocity[0].tolist()
+
     def joint_state(self) -> tuple[np.ndarray, np.ndarray]:
         """See :meth:`physai.physics.Physics.joint_state`."""
         return self._position[None].copy(), self._velocity[None].copy()

@@ -1,4 +1,4 @@
-"""All algorithms race against Stable-Baselines3's."""
+"""Algorithms race against Stable-Baselines3's."""
 
 import pytest
 from rich.console import Console
@@ -27,16 +27,17 @@ def test_the_table_says_who_did_not_arrive():
 
 
 @pytest.mark.slow
-def test_all_algorithms_race(monkeypatch):
+def test_algorithms_race(monkeypatch):
+    monkeypatch.setattr(algorithms, "ALGORITHMS", ("a2c", "td3"))
     monkeypatch.setattr(algorithms, "GOALS", 20)
     monkeypatch.setattr("physai.bench.training.GOALS", 20)
     monkeypatch.setattr("physai.bench.training.JUDGE_EVERY", 1024)
     reacher = algorithms.reacher
-    short = ("env.task.max_steps=10", "total_frames=2048")
+    short = ("env.task.max_steps=10", "total_frames=2560")
     monkeypatch.setattr(algorithms, "reacher", lambda seed, *overrides: reacher(seed, *overrides, *short))
     races = algorithms.measure_algorithms(seed=0, sb3_seconds=0.1)
-    assert list(races) == ["ppo", "a2c", "sac", "td3", "ddpg"]
+    assert list(races) == ["a2c", "td3"]
     for ours, theirs in races.values():
-        assert ours.frames >= 2048
+        assert ours.frames >= 2560
         assert theirs.frames >= 1024
         assert min(ours.seconds, theirs.seconds) > 0

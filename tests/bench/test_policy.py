@@ -8,7 +8,7 @@ from physai.bench import policy
 
 @pytest.mark.slow
 def test_every_form_is_timed_and_shown(monkeypatch):
-    monkeypatch.setattr(policy, "FRAMES", 4096)
+    monkeypatch.setattr(policy, "FRAMES", 2048)
     monkeypatch.setattr(policy, "ROUNDS", 2)
     monkeypatch.setattr(policy, "CALLS", 20)
     times, load = policy.measure_policy(seed=0)
