@@ -5,6 +5,7 @@ import functools
 import gc
 import itertools
 import os
+import select
 import shutil
 import signal
 import socket
@@ -181,7 +182,7 @@ def _guarded(job: Job) -> Callable[[DictConfig], object]:
                 return job(config, folder)
         print(f"\n[{context.job.num}] {context.job.override_dirname}", flush=True)
         here = (os.getpid(), socket.gethostname()) == (starter, host)
-        if not here and socket.gethostname() == host and "SLURM_JOB_ID" not in os.environ:
+        if not here and socket.gethostname() == host and sys.platform == "linux" and "SLURM_JOB_ID" not in os.environ:
             _end_with(starter)
         try:
             with contextlib.nullcontext() if here else _output_to(folder / "output.txt"):
@@ -201,14 +202,11 @@ def _end_with(starter: int) -> None:
     """Stop this process, as SIGTERM does, once the sweep that it works for is gone; not all launchers see to that."""
 
     def watch() -> None:
-        while True:
-            time.sleep(1)
-            try:
-                os.kill(starter, 0)
-            except ProcessLookupError:
-                os.kill(os.getpid(), signal.SIGTERM)  # a run saves itself
-                time.sleep(20)
-                os._exit(128 + signal.SIGTERM)
+        with contextlib.suppress(ProcessLookupError):  # it is gone already
+            select.select([os.pidfd_open(starter)], [], [])  # also ends where nobody has asked how the sweep ended
+        os.kill(os.getpid(), signal.SIGTERM)  # a run saves itself
+        time.sleep(20)
+        os._exit(128 + signal.SIGTERM)
 
     threading.Thread(target=watch, daemon=True).start()
 

@@ -49,7 +49,8 @@ def plot_runs(runs: Sequence[Path], output: Path) -> None:
         axis.xaxis.set_major_formatter(matplotlib.ticker.EngFormatter(sep=""))
         axis.spines[["top", "right"]].set_visible(False)
     handles, labels = axes[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=min(3, len(labels)), frameon=False)
+    columns = max(1, min(3, 120 // max(map(len, labels), default=1)))  # what fits beside each other
+    figure.legend(handles, labels, loc="outside lower center", ncols=min(columns, len(labels)), frameon=False)
     figure.savefig(output, dpi=130)
     plt.close(figure)
 
