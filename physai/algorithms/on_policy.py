@@ -111,8 +111,8 @@ class OnPolicy:
 
     def _minibatches(self) -> Iterator[TensorDictBase]:
         # One draw an epoch, and slices of it: drawing each minibatch from the buffer takes eight times as long.
-        shuffled, size = self.buffer.sample(), self.minibatch_size
-        return (shuffled[start : start + size] for start in range(0, len(shuffled) - size + 1, size))
+        parts = self.buffer.sample().split(self.minibatch_size)
+        return (part for part in parts if len(part) == self.minibatch_size)
 
     def weights(self) -> dict[str, Tensor]:
         """All weights by name."""

@@ -19,7 +19,7 @@ from physai.training.evaluation import evaluate
 TARGET = 0.99
 GOALS = 1000
 GOALS_SEED = derive(0, "benchmark goals")  # the same for all, unseen in training
-JUDGE_EVERY = 8192  # frames
+JUDGE_EVERY = 4096  # frames
 
 
 @dataclass

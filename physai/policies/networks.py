@@ -7,12 +7,13 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
-from torch.distributions import Distribution, Independent, Normal
+from torch.distributions import Distribution
 from torchrl.data import Composite
 from torchrl.envs.utils import ExplorationType, exploration_type
 
 from physai.config import Count, PositiveFloat, nearest
 from physai.errors import UserError
+from physai.policies.distributions import HALF_LOG_TWO_PI, DiagonalNormal
 
 
 def input_size(observation_spec: Composite, in_keys: Sequence[str], where: str) -> int:
@@ -108,10 +109,7 @@ class GaussianActor(TensorDictModuleBase):
 
     def get_dist(self, tensordict: TensorDictBase) -> Distribution:
         """Return the distribution of the latent action."""
-        mean = self.mean(tensordict)
-        return Independent(
-            Normal(mean, self.log_std.exp().expand_as(mean), validate_args=False), 1, validate_args=False
-        )
+        return DiagonalNormal(self.mean(tensordict), self.log_std)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Act."""
@@ -121,13 +119,10 @@ class GaussianActor(TensorDictModuleBase):
         """Draw around a mean of the latent action, [.., n]."""
         noise = torch.randn_like(mean) if exploration_type() == ExplorationType.RANDOM else torch.zeros_like(mean)
         latent = torch.addcmul(mean, self.log_std.exp(), noise)
-        log_prob = -0.5 * noise.square().sum(-1) - (self.log_std + _HALF_LOG_TWO_PI).sum()
+        log_prob = -0.5 * noise.square().sum(-1) - (self.log_std + HALF_LOG_TWO_PI).sum()
         tensordict.set("action", torch.tanh(latent))
         tensordict.set("latent_action", latent)
         return tensordict.set("action_log_prob", log_prob)
-
-
-_HALF_LOG_TWO_PI = 0.9189385332046727
 
 
 class Critic(TensorDictModuleBase):

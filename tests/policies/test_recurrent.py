@@ -42,7 +42,7 @@ def by_hand(actor, x, memory):
 
 
 def test_a_sequence_is_what_single_steps_make_of_it_from_zero_wherever_an_episode_begins(actor, sequences):
-    mean = actor.get_dist(sequences).base_dist.loc
+    mean = actor.get_dist(sequences).mean
     for row in range(ROWS):
         memory = sequences["memory"][row, 0]
         for step in range(STEPS):

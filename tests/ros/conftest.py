@@ -53,6 +53,18 @@ def start(domain: int) -> Iterator[Callable[..., Process]]:
 
 
 @pytest.fixture
+def start_robot(start: Callable[..., Process]) -> Callable[..., Process]:
+    """Start a virtual robot and wait until it is there: who connects to one looks for it for some seconds only."""
+
+    def start_robot(*args: str, **parameters: Any) -> Process:
+        robot = start("virtual_robot", *args, **parameters)
+        robot.says("takes velocities", 60.0)
+        return robot
+
+    return start_robot
+
+
+@pytest.fixture
 def peer(domain: int) -> Iterator[Peer]:
     """A node in this process that listens to everything."""
     made = Peer(domain)

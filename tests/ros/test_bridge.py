@@ -49,16 +49,16 @@ def in_fresh_python(script):
     return subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=120)
 
 
-def test_gymnasium_s_checker_passes_without_a_warning(start, make):
-    start("virtual_robot")
+def test_gymnasium_s_checker_passes_without_a_warning(start_robot, make):
+    start_robot()
     env = make().unwrapped
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         check_env(env)
 
 
-def test_it_renders_and_closes_twice(start, make):
-    start("virtual_robot")
+def test_it_renders_and_closes_twice(start_robot, make):
+    start_robot()
     env = make(render_mode="rgb_array")
     env.reset(seed=0)
     assert env.render().shape == (360, 480, 3)
@@ -66,8 +66,8 @@ def test_it_renders_and_closes_twice(start, make):
     env.close()
 
 
-def test_a_second_env_takes_the_robot_over_and_the_first_says_so(start, make):
-    start("virtual_robot")
+def test_a_second_env_takes_the_robot_over_and_the_first_says_so(start_robot, make):
+    start_robot()
     first = make()
     first.reset(seed=0)
     second = make()
@@ -77,8 +77,8 @@ def test_a_second_env_takes_the_robot_over_and_the_first_says_so(start, make):
     second.step(second.action_space.sample())
 
 
-def test_an_episode_over_ros_is_the_episode_in_process(start, make):
-    start("virtual_robot")
+def test_an_episode_over_ros_is_the_episode_in_process(start_robot, make):
+    start_robot()
     ours = make()
     theirs = gymnasium.make("physai/Reacher-v0", overrides=["env.task.start_spread=[0.0,0.0]"])
     assert ours.observation_space == theirs.observation_space
@@ -116,8 +116,8 @@ def test_where_there_is_no_robot_evaluate_says_so_in_one_line(start, run):
     assert not list(run.glob("evaluation_*"))
 
 
-def test_evaluate_refuses_to_randomize_a_robot_behind_ros(start, peer, run):
-    start("virtual_robot")
+def test_evaluate_refuses_to_randomize_a_robot_behind_ros(start, start_robot, peer, run):
+    start_robot()
     command = start.run(evaluate(f"run={run}", "env=ros_reacher", "randomization=default"))
     assert command.wait(60.0) == 2
     assert "cannot be set; choose randomization=none" in command.says("error:")
@@ -125,8 +125,8 @@ def test_evaluate_refuses_to_randomize_a_robot_behind_ros(start, peer, run):
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-def test_an_interrupted_evaluation_leaves_a_standing_arm(start, peer, run, number, code):
-    start("virtual_robot")
+def test_an_interrupted_evaluation_leaves_a_standing_arm(start, start_robot, peer, run, number, code):
+    start_robot()
     command = start.run(evaluate(f"run={run}", "env=ros_reacher"))
     wait_for(lambda: any(any(velocity) for _, velocity in peer.commands), 60.0, "a command")
     command.signal(number)
@@ -137,8 +137,8 @@ def test_an_interrupted_evaluation_leaves_a_standing_arm(start, peer, run, numbe
 
 
 @pytest.mark.slow
-def test_a_policy_reaches_the_same_goals_over_ros_as_in_process(start, run):
-    start("virtual_robot")
+def test_a_policy_reaches_the_same_goals_over_ros_as_in_process(start, start_robot, run):
+    start_robot()
     here = ["env=reacher", "env.task.start_spread=[0.0,0.0]", "randomization=none"]
     for arguments in (["env=ros_reacher"], here):
         command = start.run(evaluate(f"run={run}", "episodes=50", *arguments))

@@ -65,8 +65,8 @@ def zeros_last(peer):
     return peer.commands and not any(peer.commands[-1][1])
 
 
-def test_steps_take_a_control_period_and_do_not_drift(start, connect):
-    start("virtual_robot")
+def test_steps_take_a_control_period_and_do_not_drift(start_robot, connect):
+    start_robot()
     physics = connect()
     home(physics)
     times = [time.monotonic()]
@@ -79,8 +79,8 @@ def test_steps_take_a_control_period_and_do_not_drift(start, connect):
     assert periods.mean() == pytest.approx(20.0, abs=1.0)
 
 
-def test_a_caller_who_is_late_gets_whole_periods_again(start, connect):
-    start("virtual_robot")
+def test_a_caller_who_is_late_gets_whole_periods_again(start_robot, connect):
+    start_robot()
     physics = connect()
     home(physics)
     move(physics, [0.1, 0.1], 2)
@@ -91,8 +91,8 @@ def test_a_caller_who_is_late_gets_whole_periods_again(start, connect):
         assert time.monotonic() - before > 0.015
 
 
-def test_joints_are_mapped_by_name_and_others_ignored(start, connect):
-    start("virtual_robot", "-p", "state_joints:=[gripper, joint2, joint1]")
+def test_joints_are_mapped_by_name_and_others_ignored(start_robot, connect):
+    start_robot("-p", "state_joints:=[gripper, joint2, joint1]")
     physics = connect()
     home(physics)
     q, qd = move(physics, [0.5, -0.25], 50)
@@ -101,8 +101,8 @@ def test_joints_are_mapped_by_name_and_others_ignored(start, connect):
     np.testing.assert_allclose(qd[0], [0.5, -0.25], atol=0.02)
 
 
-def test_the_reset_service_puts_a_virtual_robot_home_at_once(start, connect):
-    start("virtual_robot")
+def test_the_reset_service_puts_a_virtual_robot_home_at_once(start_robot, connect):
+    start_robot()
     physics = connect()
     move(physics, [2.0, -2.0], 50)
     before = time.monotonic()
@@ -111,8 +111,8 @@ def test_the_reset_service_puts_a_virtual_robot_home_at_once(start, connect):
     np.testing.assert_allclose(physics.joint_state()[0], 0.0, atol=0.02)
 
 
-def test_a_robot_without_the_service_is_driven_home_and_stands_there(start, connect, peer):
-    start("virtual_robot", "-r", "__node:=arm")
+def test_a_robot_without_the_service_is_driven_home_and_stands_there(start_robot, connect, peer):
+    start_robot("-r", "__node:=arm")
     physics = connect(homing_speed=1.0)
     move(physics, [2.0, -1.0], 40)
     since = time.monotonic()
@@ -125,8 +125,8 @@ def test_a_robot_without_the_service_is_driven_home_and_stands_there(start, conn
     assert not sent[-1].any()
 
 
-def test_a_continuous_joint_goes_the_shorter_way_around(start, connect):
-    start("virtual_robot", "-r", "__node:=arm")
+def test_a_continuous_joint_goes_the_shorter_way_around(start_robot, connect):
+    start_robot("-r", "__node:=arm")
     physics = connect()
     physics.reset(ROW, np.array([[3.0, 0.0]]), REST)
     physics.reset(ROW, np.array([[-3.0, 0.0]]), REST)
@@ -134,16 +134,16 @@ def test_a_continuous_joint_goes_the_shorter_way_around(start, connect):
 
 
 @pytest.mark.slow
-def test_an_arm_that_does_not_get_to_its_start_is_named(start, connect, peer):
-    start("virtual_robot", "-r", "__node:=arm", "-r", f"{TOPIC}:=/elsewhere")
+def test_an_arm_that_does_not_get_to_its_start_is_named(start_robot, connect, peer):
+    start_robot("-r", "__node:=arm", "-r", f"{TOPIC}:=/elsewhere")
     physics = connect()
     with pytest.raises(RobotError, match=r"does not get to its start: 0.500 rad off after \d s"):
         physics.reset(ROW, np.array([[0.5, 0.0]]), REST)
     wait_for(lambda: zeros_last(peer))
 
 
-def test_a_robot_that_falls_silent_is_stopped_and_can_be_used_again(start, connect, peer):
-    robot = start("virtual_robot")
+def test_a_robot_that_falls_silent_is_stopped_and_can_be_used_again(start_robot, connect, peer):
+    robot = start_robot()
     physics = connect()
     home(physics)
     move(physics, [0.5, 0.5], 5)
@@ -167,8 +167,8 @@ def test_a_robot_that_falls_silent_is_stopped_and_can_be_used_again(start, conne
         ({"fault_stop": True}, {"fault_stop": False}, "within 0.5 s"),
     ],
 )
-def test_states_that_cannot_be_used_end_in_zeros_and_an_error(start, connect, peer, fault, healthy, reason):
-    start("virtual_robot")
+def test_states_that_cannot_be_used_end_in_zeros_and_an_error(start_robot, connect, peer, fault, healthy, reason):
+    start_robot()
     physics = connect()
     move(physics, [0.5, 0.5], 5)
     set_fault(peer, **fault)
@@ -187,9 +187,8 @@ def test_states_that_cannot_be_used_end_in_zeros_and_an_error(start, connect, pe
         (["-r", f"{TOPIC}:=/elsewhere"], "no controller listens to /joint_velocity_controller/commands"),
     ],
 )
-def test_a_robot_that_cannot_be_driven_is_refused(start, connect, options, reason):
-    robot = start("virtual_robot", *options)
-    robot.says("takes velocities")
+def test_a_robot_that_cannot_be_driven_is_refused(start_robot, connect, options, reason):
+    robot = start_robot(*options)
     with pytest.raises(RobotError, match=reason):
         connect()
 
@@ -199,16 +198,16 @@ def test_where_there_is_no_robot_one_line_says_so(connect):
         connect()
 
 
-def test_a_robot_that_another_one_commands_is_left_alone(start, connect, peer):
-    start("virtual_robot")
+def test_a_robot_that_another_one_commands_is_left_alone(start_robot, connect, peer):
+    start_robot()
     peer.publisher(Float64MultiArray, TOPIC)
     with pytest.raises(RobotError, match=f"another publisher commands {TOPIC}: peer"):
         connect()
     assert peer.commands == []
 
 
-def test_a_rival_who_comes_later_ends_the_episode_with_zeros(start, connect, peer):
-    start("virtual_robot")
+def test_a_rival_who_comes_later_ends_the_episode_with_zeros(start_robot, connect, peer):
+    start_robot()
     physics = connect()
     move(physics, [0.5, 0.5], 5)
     rival = peer.publisher(Float64MultiArray, TOPIC)
@@ -220,8 +219,8 @@ def test_a_rival_who_comes_later_ends_the_episode_with_zeros(start, connect, pee
     move(physics, [0.5, 0.5], 2)
 
 
-def test_an_arm_whose_caller_pauses_is_stopped(start, connect, peer):
-    start("virtual_robot")
+def test_an_arm_whose_caller_pauses_is_stopped(start_robot, connect, peer):
+    start_robot()
     physics = connect()
     move(physics, [0.5, 0.5], 5)
     paused = time.monotonic()
@@ -230,8 +229,8 @@ def test_an_arm_whose_caller_pauses_is_stopped(start, connect, peer):
     move(physics, [0.5, 0.5], 5)
 
 
-def test_an_arm_whose_physics_is_forgotten_is_stopped(start, connect, spec, peer):
-    start("virtual_robot")
+def test_an_arm_whose_physics_is_forgotten_is_stopped(start_robot, connect, spec, peer):
+    start_robot()
     connect().close()  # it sets the domain
     physics = RosPhysics(spec, 1, DT, 1, **OPTIONS)
     move(physics, [0.5, 0.5], 5)
@@ -242,8 +241,8 @@ def test_an_arm_whose_physics_is_forgotten_is_stopped(start, connect, spec, peer
 
 
 @pytest.mark.parametrize("end", ["", "raise RuntimeError('a bug')", "os.kill(os.getpid(), signal.SIGINT)"])
-def test_a_program_that_ends_in_any_way_leaves_a_standing_arm(start, peer, end):
-    start("virtual_robot")
+def test_a_program_that_ends_in_any_way_leaves_a_standing_arm(start, start_robot, peer, end):
+    start_robot()
     script = f"""
 import os, signal
 import numpy as np, gymnasium, physai
@@ -260,12 +259,12 @@ for _ in range(10):
     assert [any(command) for _, command in peer.commands[-3:]] == [False] * 3, program.output
 
 
-def test_what_a_robot_behind_ros_cannot_do_is_refused_in_one_line(start, connect, spec, peer):
+def test_what_a_robot_behind_ros_cannot_do_is_refused_in_one_line(start_robot, connect, spec, peer):
     with pytest.raises(UserError, match="there is one robot behind ROS, not 2"):
         connect(robots=2)
     with pytest.raises(UserError, match=r"homing_speed: 9.0 rad/s is beyond the limit of 'planar_arm', 2.5 rad/s"):
         connect(homing_speed=9.0)
-    start("virtual_robot")
+    start_robot()
     physics = connect()
     with pytest.raises(UserError, match=r"cannot be set; choose randomization=none"):
         physics.reset(ROW, REST, REST, nominal_dynamics(spec))
@@ -281,8 +280,8 @@ def test_what_a_robot_behind_ros_cannot_do_is_refused_in_one_line(start, connect
     physics.close()
 
 
-def test_topics_can_have_other_names(start, connect):
-    start("virtual_robot", "-r", "/joint_states:=/left/joint_states", "-r", f"{TOPIC}:=/left/commands")
+def test_topics_can_have_other_names(start_robot, connect):
+    start_robot("-r", "/joint_states:=/left/joint_states", "-r", f"{TOPIC}:=/left/commands")
     physics = connect(remap=["/joint_states:=/left/joint_states", f"{TOPIC}:=/left/commands"])
     q, _ = move(physics, [0.5, 0.5], 25)
     np.testing.assert_allclose(q, 0.25, atol=0.05)
