@@ -110,6 +110,8 @@ def _check_all(name: str, check: Callable[[DictConfig], object], given: list[str
             "hydra/launcher=submitit_slurm: there is no srun here, so this is no computer of a SLURM cluster"
         )
     for config in jobs:
+        if sweep and launcher.endswith(".RayLauncher") and OmegaConf.select(config, "collector.ray_init"):
+            raise UserError("hydra/launcher=ray: a job of Ray's starts no other Ray: choose another collector")
         with open_dict(config):
             del config["hydra"]
         check(config)

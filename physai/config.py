@@ -64,15 +64,15 @@ def _ceil_div(number: Any, divisor: Any) -> int:
         return 1
 
 
-def _cores_of_job(threads: int, processes: int) -> int:
-    """Resolver ``${cores_of_job:threads,processes}``: what a run keeps busy."""
-    return max(1, threads * processes)
+def _cores_of_job(threads: int, processes: int, sync: bool) -> int:
+    """Resolver ``${cores_of_job:threads,processes,sync}``: what a run keeps busy; with ``sync``, it takes turns."""
+    return max(1, threads, processes) if sync else threads + processes
 
 
-def _jobs_at_once(threads: int, processes: int) -> int:
-    """Resolver ``${jobs_at_once:threads,processes}``: how many runs this computer's cores are enough for."""
+def _jobs_at_once(threads: int, processes: int, sync: bool) -> int:
+    """Resolver ``${jobs_at_once:threads,processes,sync}``: how many runs this computer's cores are enough for."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return max(1, cores // _cores_of_job(threads, processes))
+    return max(1, cores // _cores_of_job(threads, processes, sync))
 
 
 def _add(number: int, other: int) -> int:
@@ -92,9 +92,8 @@ for _resolver in (_add, _ceil_div, _cores_of_job, _jobs_at_once, _search_space):
 
 def jobs_at_once(config: DictConfig) -> int:
     """How many runs with this config this computer's cores are enough for."""
-    return _jobs_at_once(
-        OmegaConf.select(config, "threads", default=1), OmegaConf.select(config, "collector.processes", default=1)
-    )
+    keys = {"threads": 1, "collector.processes": 1, "collector.sync": True}  # not all commands have these
+    return _jobs_at_once(*(OmegaConf.select(config, key, default=value) for key, value in keys.items()))
 
 
 def conf_dir() -> Path:

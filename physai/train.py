@@ -25,8 +25,12 @@ def main() -> None:
         with cli.guard():
             _resume(Path(resumed[-1].strip("'\"")), others)
     else:
-        with closing(_Training()) as training:
+        with closing(_Training(keep=not _sweeps())) as training:
             cli.main("train", training.train, training.check)
+
+
+def _sweeps() -> bool:
+    return not {"-m", "--multirun"}.isdisjoint(sys.argv)
 
 
 def _config(node: DictConfig) -> "TrainConfig":
@@ -37,10 +41,14 @@ def _config(node: DictConfig) -> "TrainConfig":
 
 
 class _Training:
-    """Builds every part of a run, so that whatever is wrong shows before a run folder exists; then trains with them."""
+    """Builds every part of a run, so that whatever is wrong shows before a run folder exists; then trains with them.
 
-    def __init__(self) -> None:
-        self._config: TrainConfig | None = None
+    Args:
+        keep: What was checked is what will be trained; the jobs of a sweep build their own parts, maybe elsewhere.
+    """
+
+    def __init__(self, keep: bool = False) -> None:
+        self._keep = keep
         self._agent: Agent | None = None
 
     def check(self, node: DictConfig) -> None:
@@ -48,9 +56,10 @@ class _Training:
         from physai.training.agent import Agent
 
         self.close()
-        self._config = _config(node)
-        self._agent = Agent.build(self._config)
+        self._agent = Agent.build(_config(node))
         script(make_deployable(self._agent.policy(), self._agent.env))  # what does not script could not be exported
+        if not self._keep:
+            self.close()
 
     def __reduce__(self) -> tuple[type, tuple[()]]:
         return _Training, ()  # a job in another process builds its own
@@ -58,8 +67,6 @@ class _Training:
     def train(self, node: DictConfig, run_dir: Path) -> float:
         """Train; return what a search makes best."""
         config = _config(node)
-        if config != self._config:  # the last to be checked is not the first of a sweep
-            self.close()
         agent, self._agent = self._agent, None
         _run(config, run_dir, resume=False, agent=agent)
         return study.objective(run_dir, config.objective)
@@ -75,7 +82,7 @@ def _resume(run_dir: Path, given: list[str]) -> None:
     from physai.config import compose
     from physai.training.run import load_config
 
-    if any(argument in ("-m", "--multirun") for argument in sys.argv):
+    if _sweeps():
         raise UserError("resume continues one run; it cannot be swept over")
     config = load_config(run_dir)
     if given:

@@ -3,9 +3,11 @@
 from pathlib import Path
 
 import pytest
+from omegaconf import OmegaConf
 
 from physai.config import compose, conf_dir, validate
 from physai.errors import UserError
+from physai.policies import GaussianActor
 from physai.training.agent import Agent
 from physai.training.config import TrainConfig
 
@@ -91,6 +93,23 @@ def test_a_privileged_critic_sees_the_physics_that_the_actor_does_not():
 
 def test_the_package_carries_no_second_copy_of_the_configs():
     assert conf_dir() == Path(__file__).parent.parent / "conf"
+
+
+def test_an_actor_that_remembers_more_than_its_config_says_is_refused():
+    with pytest.raises(UserError, match=r"policy\.actor: how much an actor remembers is its argument memory_size"):
+        Agent.build(small("policy.actor._target_=tests.test_config.Rememberer"))
+
+
+class Rememberer(GaussianActor):
+    """Its memory is nobody's business."""
+
+    memory_size = 3
+
+
+@pytest.mark.parametrize(("processes", "sync", "cores"), [(1, True, 1), (2, True, 2), (1, False, 2), (2, False, 3)])
+def test_a_run_that_collects_while_it_learns_keeps_one_more_core_busy(processes, sync, cores):
+    node = OmegaConf.create({"cores": f"${{cores_of_job:1,{processes},{sync}}}"})
+    assert node.cores == cores
 
 
 def test_counts_may_be_written_as_people_write_them():

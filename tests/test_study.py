@@ -74,6 +74,12 @@ def test_time_to_target_is_the_first_evaluation_that_has_it(tmp_path):
     assert study.objective(tmp_path, OmegaConf.merge(settings, {"target": 1.0})) == math.inf
 
 
+@pytest.mark.parametrize("override", ["objective.target=0.9", "objective.direction=minimize"])
+def test_a_search_in_the_wrong_direction_is_refused(override):
+    with pytest.raises(UserError, match="a target's time is to be minimized"):
+        validate(TrainConfig, compose("train", [override]))
+
+
 def test_success_is_that_of_the_final_evaluation(tmp_path):
     (tmp_path / "summary.json").write_text(json.dumps({"success_rate": 0.5}))
     assert study.objective(tmp_path, search().objective) == 0.5

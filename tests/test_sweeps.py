@@ -85,6 +85,12 @@ def test_ray_runs_a_sweep(tmp_path):
     assert sorted(finished(tmp_path / "sweep")) == ["0", "1"]
 
 
+def test_a_ray_in_each_job_of_ray_is_refused_before_anything_starts(tmp_path):
+    code, output = run("hydra/launcher=ray", "collector=ray", "seed=0,1", cwd=tmp_path)
+    assert (code, output.strip().splitlines()[-1][:24]) == (2, "error: hydra/launcher=ra"), output
+    assert not list(tmp_path.iterdir())
+
+
 @pytest.mark.parametrize(
     ("launcher", "number"),
     [

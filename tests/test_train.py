@@ -8,6 +8,7 @@ import pytest
 from physai import cli, train
 from physai.config import compose
 from physai.errors import UserError
+from physai.training.agent import Agent
 from tests.training.small import SMALL
 
 AT_HELP = """
@@ -57,16 +58,22 @@ def training(monkeypatch):
     """The command, which notes what it would train instead of training it."""
     trained = []
     monkeypatch.setattr(train, "_run", lambda config, run_dir, resume, agent: trained.append(agent))
-    command = train._Training()
-    yield command, trained
-    command.close()
+    commands = []
+
+    def make(keep):
+        commands.append(train._Training(keep))
+        return commands[-1], trained
+
+    yield make
+    for command in commands:
+        command.close()
     for agent in trained:
         if agent is not None:
             agent.close()
 
 
-def test_what_was_checked_last_is_what_the_first_job_trains(training, tmp_path):
-    command, trained = training
+def test_what_was_checked_is_what_a_run_trains(training, tmp_path):
+    command, trained = training(keep=True)
     node = compose("train", SMALL)
     command.check(node)
     command.train(node, tmp_path)
@@ -75,23 +82,17 @@ def test_what_was_checked_last_is_what_the_first_job_trains(training, tmp_path):
     assert trained[1] is None  # random numbers have been drawn since
 
 
-def test_a_job_is_not_given_what_was_built_from_another_config(training, tmp_path):
-    command, trained = training
+def test_the_jobs_of_a_sweep_build_their_own_and_its_check_keeps_no_robots(training, monkeypatch, tmp_path):
+    command, trained = training(keep=False)
+    built, build = [], Agent.build
+    monkeypatch.setattr(Agent, "build", lambda config: built.append(build(config)) or built[-1])
     nodes = [compose("train", [*SMALL, f"seed={seed}"]) for seed in (0, 1)]
     for node in nodes:
         command.check(node)
+    assert [agent.env.simulation.physics._worlds for agent in built] == [[], []]
     for node in nodes:
         command.train(node, tmp_path)
     assert trained == [None, None]
-
-
-def test_a_sweep_s_check_keeps_the_robots_of_one_combination_at_most(training):
-    command, _ = training
-    physics = []
-    for seed in range(3):
-        command.check(compose("train", [*SMALL, f"seed={seed}"]))
-        physics.append(command._agent.env.simulation.physics)
-    assert [len(engine._worlds) for engine in physics] == [0, 0, 1]
 
 
 @pytest.mark.parametrize("error", [None, UserError("no such thing")])

@@ -10,7 +10,7 @@ from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LRScheduler
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.data.replay_buffers import RandomSampler
-from torchrl.objectives import TargetNetUpdater, TD3Loss
+from torchrl.objectives import DDPGLoss, TargetNetUpdater, TD3Loss
 from torchrl.objectives.utils import ValueEstimators
 
 from physai.algorithms.descent import Descent, check_ranges
@@ -41,7 +41,7 @@ class OffPolicy:
         target: Makes what lets the target networks follow, from the loss module.
         warmup_frames: So many frames are collected with random actions before anything is learned.
         frames_per_update: A gradient step for each so many frames.
-        actor_every: The actor learns in every so-manieth gradient step (2 in TD3).
+        actor_every: The actor learns in every so-manieth gradient step (2 in TD3); targets follow in each.
         max_grad_norm: Gradients are clipped to this norm.
     """
 
@@ -78,11 +78,14 @@ class OffPolicy:
         except (AttributeError, IndexError):  # no get_dist, or no log_prob_keys
             name = type(networks.actor).__name__
             raise UserError(f"policy.actor: this loss draws from a distribution, and {name} has none") from None
+        if (drawn := self.loss.tensor_keys.action) != "action":
+            raise UserError(f"policy.actor: this loss would learn from '{drawn}', and the critic judges 'action'")
         judged = {_path(key) for key in networks.critic.in_keys}
         if isinstance(self.loss, TD3Loss) and (unseen := judged - {("action",), *map(_path, networks.actor.in_keys)}):
             raise UserError(f"policy.critic.in_keys: in TD3Loss it sees what the actor sees, not '{min(unseen)[0]}'")
         self.loss.make_value_estimator(ValueEstimators.TD0, gamma=gamma)
         check_ranges("algo", self.loss.value_estimator)
+        self._squared = isinstance(self.loss, TD3Loss | DDPGLoss)  # so is the error that these report
         self._target = target(self.loss)
         self.descent = Descent(self.loss, optimizer, scheduler, max_grad_norm)
         self.warmup_frames = warmup_frames
@@ -131,7 +134,9 @@ class OffPolicy:
                 figures.set("grad_norm", torch.zeros(()))
             results.append(figures)
             priorities.append(minibatch.get("td_error").detach())
-        self.buffer.update_priority(drawn.get("index"), torch.cat(priorities))
+        if isinstance(self.buffer.sampler, ProportionalSampler):
+            errors = torch.cat(priorities)
+            self.buffer.update_priority(drawn.get("index"), errors.sqrt() if self._squared else errors)
         means: TensorDictBase = torch.stack(results).mean(dim=0)
         return {key: float(value) for key, value in means.items()} | {"lr": self.descent.end_batch()}
 

@@ -27,7 +27,7 @@ class OnPolicy:
         loss: Makes the loss module from ``actor_network`` and ``critic_network``; all its ``loss_*`` outputs are
             summed.
         advantage: Makes the advantage module from ``value_network``.
-        buffer: Replay buffer that hands out a batch in another order for each epoch.
+        buffer: Replay buffer that hands out a batch in another order for each epoch; not of an actor that remembers.
         minibatch_size: Samples of a gradient step; what is left over at the end of an epoch is not used. An actor that
             remembers learns from whole sequences: as many as have so many samples, at least one.
         optimizer: Makes the optimizer from the parameters.

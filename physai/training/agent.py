@@ -113,7 +113,10 @@ class Agent:
 def make_actor(config: TrainConfig, env: TransformedRobotEnv) -> TensorDictModuleBase:
     """Build an untrained actor for an env."""
     inputs = input_size(env.observation_spec, config.policy.actor["in_keys"], "policy.actor")
-    return _make("policy.actor", config.policy.actor, in_features=inputs, action_size=env.action_spec.shape[-1])
+    actor = _make("policy.actor", config.policy.actor, in_features=inputs, action_size=env.action_spec.shape[-1])
+    if getattr(actor, "memory_size", 0) != config.policy.memory_size:  # the env is made first, from the config
+        raise UserError("policy.actor: how much an actor remembers is its argument memory_size")
+    return actor
 
 
 def load_policy_state(actor: TensorDictModuleBase, env: TransformedRobotEnv, state: dict[str, Any]) -> None:

@@ -2,7 +2,7 @@
 
 from typing import Annotated, Literal
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from physai.collectors import CollectorConfig
 from physai.config import Config, Count, Seed, Target
@@ -44,6 +44,12 @@ class ObjectiveConfig(Config):
 
     direction: Literal["maximize", "minimize"]
     target: Annotated[float, Field(gt=0, le=1)] | None
+
+    @model_validator(mode="after")
+    def _direction_fits(self) -> "ObjectiveConfig":
+        if (self.direction == "minimize") != (self.target is not None):
+            raise ValueError("a target's time is to be minimized, a success rate without target to be maximized")
+        return self
 
 
 class TrainConfig(Config):

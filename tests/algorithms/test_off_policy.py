@@ -274,6 +274,24 @@ def test_surprising_frames_are_drawn_more_often_and_count_less():
     assert loss < errors.mean()
 
 
+@pytest.mark.parametrize("name", ["td3", "ddpg"])
+def test_a_priority_is_a_power_of_the_td_error_where_the_loss_reports_its_square_too(name):
+    algorithm = build(name, *PRIORITIZED, "algo.warmup_frames=100_000")
+    calls = []
+    algorithm.loss.register_forward_hook(lambda _, arguments, losses: calls.append((arguments[0], losses)))
+    algorithm.update(batch(0))
+    ((frames, losses),) = calls
+    error = (losses["pred_value"] - losses["target_value"]).abs().reshape(-1, len(frames)).max(dim=0)[0]
+    priority = algorithm.buffer.sampler.priorities[frames["index"]].float()
+    torch.testing.assert_close(priority, (error + 1e-6) ** 0.7)
+    assert error.max() > 1  # the square of which is larger
+
+
+def test_uniform_sampling_is_told_of_no_priorities(recwarn):
+    build("sac", "algo.warmup_frames=100_000").update(batch(0))
+    assert not [warning for warning in recwarn if "update_priority" in str(warning.message)]
+
+
 def test_a_reward_that_is_not_a_number_stops_before_the_step_and_hands_over_the_minibatch():
     algorithm = build("sac")
     algorithm.update(batch(0))
@@ -291,6 +309,10 @@ def test_a_reward_that_is_not_a_number_stops_before_the_step_and_hands_over_the_
         (["algo=sac", "policy=mlp"], r"policy\.critic\.in_keys: .* it must see 'action'"),
         (["algo=ppo", "policy=mlp_soft"], r"policy\.critic\.in_keys: .* it must not see 'action'"),
         (["algo=sac", "policy=mlp_deterministic"], r"policy\.actor: .* distribution, and DeterministicActor has none"),
+        (
+            ["algo=sac", "policy=mlp", "policy.critic.in_keys=[normalized_observation,features,action]"],
+            r"policy\.actor: this loss would learn from 'latent_action'",
+        ),
         (["algo=sac", "policy=gru"], r"policy\.actor: .* must not remember"),
         (
             ["algo=td3", "policy.critic.in_keys=[normalized_observation,physics_parameters,action]"],

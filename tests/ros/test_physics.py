@@ -188,7 +188,7 @@ def test_states_that_cannot_be_used_end_in_zeros_and_an_error(start_robot, conne
     ],
 )
 def test_a_robot_that_cannot_be_driven_is_refused(start_robot, connect, options, reason):
-    robot = start_robot(*options)
+    start_robot(*options)
     with pytest.raises(RobotError, match=reason):
         connect()
 

@@ -91,7 +91,6 @@ def test_a_killed_worker_ends_the_run_in_one_line_and_it_goes_on(finished, tmp_p
     ("collector", "number", "code"),
     [
         ("multi_sync", signal.SIGINT, 130),
-        ("multi_async", signal.SIGTERM, 143),
         pytest.param("ray", signal.SIGTERM, 143, marks=needs_ray),
     ],
 )
