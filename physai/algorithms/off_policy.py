@@ -78,7 +78,7 @@ class OffPolicy:
         except (AttributeError, IndexError):  # no get_dist, or no log_prob_keys
             name = type(networks.actor).__name__
             raise UserError(f"policy.actor: this loss draws from a distribution, and {name} has none") from None
-        if (drawn := self.loss.tensor_keys.action) != "action":
+        if (drawn := getattr(self.loss.tensor_keys, "action", "action")) != "action":
             raise UserError(f"policy.actor: this loss would learn from '{drawn}', and the critic judges 'action'")
         judged = {_path(key) for key in networks.critic.in_keys}
         if isinstance(self.loss, TD3Loss) and (unseen := judged - {("action",), *map(_path, networks.actor.in_keys)}):
