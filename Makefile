@@ -41,8 +41,8 @@ demo: $(VENV)/.installed-ros  ## Let the newest policy drive a virtual robot ove
 test: $(VENV)/.installed-dev  ## Run all tests (ARGS="-m 'not slow'" for the quick ones)
 	@echo "==> Testing"
 	$(BIN)/python -m pytest -n 2 --dist worksteal --ignore tests/ros $(ARGS)
-	@echo "==> Testing the ROS 2 nodes, which live in real time: no training beside them"
-	$(BIN)/python -m pytest -n 2 --dist worksteal tests/ros $(ARGS)
+	@echo "==> Testing the ROS 2 nodes, which live in real time: nothing is at work beside them"
+	$(BIN)/python -m pytest tests/ros $(ARGS)
 
 bench: $(VENV)/.installed-dev  ## Measure speed against bare PyBullet, rclpy and Stable-Baselines3
 	@echo "==> Measuring (all of it takes an hour; ARGS=--collection and the like choose a part)"
