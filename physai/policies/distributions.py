@@ -12,7 +12,7 @@ HALF_LOG_TWO_PI = 0.5 * math.log(2 * math.pi)
 class DiagonalNormal(Distribution):
     """A normal distribution of independent components whose deviations are the same in all rows.
 
-    ``Independent(Normal(mean, std), 1)`` says the same in twice as many operations; a test holds the two against each
+    ``Independent(Normal(mean, std), 1)`` says the same in more operations; a test holds the two against each
     other.
 
     Args:

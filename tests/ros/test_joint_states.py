@@ -101,15 +101,12 @@ COUNTED = {
 
 @pytest.mark.parametrize("change", GOOD.values(), ids=GOOD)
 def test_the_arm_moves_on(loop, change):
-    for _ in range(10):  # a busy machine may cause a hold in one second or another
-        loop.rest()
-        loop.arm.change = change
-        since = loop.start_from_here()
-        wait_for(lambda: loop.peer.commands[-1][0] > since + 1.0)  # noqa: B023  # it is asked at once
-        if all(any(velocity) for at, velocity in loop.peer.commands if at > since):
-            assert loop.peer.states[-1][1] == "active"
-            return
-    pytest.fail("there was a hold in each of ten seconds")
+    loop.rest()
+    loop.arm.change = change
+    since = loop.start_from_here()
+    wait_for(lambda: loop.peer.commands[-1][0] > since + 1.0)
+    assert all(any(velocity) for at, velocity in loop.peer.commands if at > since)
+    assert loop.peer.states[-1][1] == "active"
 
 
 @pytest.mark.parametrize("name", BAD)
