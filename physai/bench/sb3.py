@@ -151,7 +151,7 @@ DEFAULTS = Settings(
     },
     trial={"n_steps": 256},
 )
-# Found by some 100 runs over robots, steps, minibatches, epochs, learning rates, discounts, networks and their
+# Found by many runs over robots, steps, minibatches, epochs, learning rates, discounts, networks and their
 # activation: what fewer frames need in more gradient steps costs more time than it saves.
 _TUNED: dict[str, Any] = {
     "learning_rate": 2e-3,
