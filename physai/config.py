@@ -90,6 +90,11 @@ for _resolver in (_add, _ceil_div, _cores_of_job, _jobs_at_once, _search_space):
     OmegaConf.register_new_resolver(_resolver.__name__.lstrip("_"), _resolver)
 
 
+# Hydra copies its sources at each of --help's 130 looks into a config group, and with them this register of all
+# plugins' configs, which hands out copies anyway: more than half of the time of --help.
+ConfigStore.__deepcopy__ = lambda self, _: self  # type: ignore[attr-defined]
+
+
 def jobs_at_once(config: DictConfig) -> int:
     """How many runs with this config this computer's cores are enough for."""
     keys = {"threads": 1, "collector.processes": 1, "collector.sync": True}  # not all commands have these
