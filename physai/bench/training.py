@@ -97,16 +97,17 @@ def measure_training(seed: int, seeds: int, sb3_frames: int) -> dict[str, list[R
         ("SB3, tuned", sb3.TUNED, seeds),
         ("SB3, defaults", sb3.DEFAULTS, 1),
     )
+    threads = {name: sb3.fastest_threads(name, settings) for name, settings, _ in sides}
     judge = make_evaluation_env(configs[0], configs[0].randomization, GOALS, GOALS_SEED)
+    races: dict[str, list[Race]] = {"physai": [], **{name: [] for name, _, _ in sides}}
     try:
-        races = {"physai": [race_physai(config, Race(f"physai, seed {config.seed}"), judge) for config in configs]}
-        for name, settings, count in sides:
-            threads, end = sb3.fastest_threads(name, settings), min(sb3_frames, settings.horizon or sb3_frames)
-            learners = (sb3.Learner(settings, one, threads) for one in range(seed, seed + count))
-            races[name] = [
-                race_sb3(learner, Race(f"{name}, seed {seed + n}"), judge, max_frames=end)
-                for n, learner in enumerate(learners)
-            ]
+        for number, config in enumerate(configs):  # the sides take turns, so that a busy machine slows them alike
+            races["physai"].append(race_physai(config, Race(f"physai, seed {config.seed}"), judge))
+            for name, settings, count in sides:
+                if number < count:
+                    learner = sb3.Learner(settings, config.seed, threads[name])
+                    end = min(sb3_frames, settings.horizon or sb3_frames)
+                    races[name].append(race_sb3(learner, Race(f"{name}, seed {config.seed}"), judge, max_frames=end))
         return races
     finally:
         judge.close()
