@@ -229,7 +229,7 @@ class Peer:
             times = [at for at, velocity in list(self.commands) if at > after and any(velocity)]
             return times if len(times) >= commands else None
 
-        return wait_for(found, 30.0, "an arm that is told to move")[-1]
+        return wait_for(found, 60.0, "an arm that is told to move")[-1]
 
     def first_zeros(self, after: float, timeout: float = 20.0) -> float:
         """Wait for a command of zeros that came after a time, and return how much later it came."""
