@@ -93,7 +93,10 @@ class RobotMultiCollector(MultiCollector):
             raise UserError(str(error).partition("\n")[0]) from error
         except (RuntimeError, ValueError, OSError, EOFError) as error:
             open_ones = [process for process in getattr(self, "procs", []) if not process._closed]
-            connection.wait([process.sentinel for process in open_ones], timeout=1)  # a broken pipe is a moment ahead
+            gone = connection.wait([process.sentinel for process in open_ones], timeout=1)
+            for process in open_ones:
+                if process.sentinel in gone:  # of a process that dies, a pipe breaks first; its exit code comes last
+                    process.join(timeout=1)
             codes = [str(process.exitcode) for process in open_ones if process.exitcode is not None]
             for process in open_ones:
                 process.kill()
