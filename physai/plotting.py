@@ -1,6 +1,5 @@
 """Training curves."""
 
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -55,16 +54,15 @@ def plot_runs(runs: Sequence[Path], output: Path) -> None:
     plt.close(figure)
 
 
-def plot_study(study: "optuna.Study", names: Mapping[str, str], output: Path) -> None:
+def plot_study(study: "optuna.Study", objective: str, names: Mapping[str, str], output: Path) -> None:
     """Draw the value of every trial (left), and how the parameters go together with it (right).
 
     Args:
         study: With at least one trial that has a value.
+        objective: What that value is.
         names: What to call its parameters.
         output: The PNG to write.
     """
-    from physai.study import objective_name
-
     trials = study.trials_dataframe(("number", "value", "params"))
     ended = trials[np.isfinite(trials["value"])]
     best = ended["value"].cummax() if study.direction.name == "MAXIMIZE" else ended["value"].cummin()
@@ -74,7 +72,7 @@ def plot_study(study: "optuna.Study", names: Mapping[str, str], output: Path) ->
     lost = trials[~np.isfinite(trials["value"])]["number"]
     left.plot(lost, np.zeros(len(lost)), "x", color="tab:red", transform=left.get_xaxis_transform(), clip_on=False,
               label="no value")  # fmt: skip
-    left.set_title(objective_name(study).capitalize())
+    left.set_title(objective.capitalize())
     left.set_xlabel("trial")
     left.xaxis.set_major_locator(matplotlib.ticker.MaxNLocator(integer=True))
     left.legend(frameon=False)
@@ -130,9 +128,3 @@ def _curve(axis: plt.Axes, members: list[pd.DataFrame], column: str, label: str)
 
 def _smooth(values: pd.Series) -> pd.Series:
     return values.interpolate(limit_direction="both").rolling(3, center=True, min_periods=1).mean()
-
-
-def read_summary(run: Path) -> dict | None:
-    """Return the summary of a finished run."""
-    path = run / "summary.json"
-    return json.loads(path.read_text()) if path.is_file() else None

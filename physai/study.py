@@ -5,13 +5,14 @@ Hydra's Optuna sweeper draws the trials and runs them; the study is ``study.db``
 
 import contextlib
 import csv
+import json
 import math
 import os
 import sys
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -40,8 +41,6 @@ def objective(run: Path, settings: "ObjectiveConfig | DictConfig") -> float:
         The success rate of the final evaluation; or, with a target, the seconds of training until an evaluation first
         had that success rate, infinity if none had.
     """
-    from physai.plotting import read_summary
-
     if settings.target is None:
         summary = read_summary(run)
         return math.nan if summary is None else summary["success_rate"]
@@ -50,6 +49,12 @@ def objective(run: Path, settings: "ObjectiveConfig | DictConfig") -> float:
             if row["evaluation/success_rate"] and float(row["evaluation/success_rate"]) >= settings.target:
                 return float(row["time/seconds"])
     return math.inf
+
+
+def read_summary(run: Path) -> dict[str, Any] | None:
+    """Return the summary of a finished run."""
+    path = run / "summary.json"
+    return json.loads(path.read_text()) if path.is_file() else None
 
 
 def searched(config: DictConfig, given: Sequence[str] = ()) -> list[str] | None:

@@ -40,14 +40,14 @@ class SweepReport(Callback):
 
     def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:
         """Report on the runs below the sweep's folder."""
-        from physai.plotting import plot_runs, read_summary
+        from physai.plotting import plot_runs
 
         folder = Path(config.hydra.sweep.dir)
         if study.searched(config) is not None:
             _report_study(folder)
             return
         runs = sorted((path.parent.parent for path in folder.glob("*/.hydra/overrides.yaml")), key=_number)
-        summaries = {run: read_summary(run) for run in runs}
+        summaries = {run: study.read_summary(run) for run in runs}
         table = Table(title=f"{folder}", title_justify="left")
         for column in ("run", "differs by", "success", "steps", "frames", "seconds"):
             table.add_column(column, justify="left" if column in ("run", "differs by") else "right")
@@ -93,7 +93,7 @@ def _report_study(folder: Path) -> None:
     if not best:
         print(f"error: none of {len(found.trials)} trials came to an end", file=sys.stderr)
         sys.exit(1)
-    plot_study(found, names, folder / "study.png")
+    plot_study(found, study.objective_name(found), names, folder / "study.png")
     print(f"All trials: {folder / 'study.csv'}, {folder / 'study.png'}. Train with the best values:")
     print("  python -m physai.train " + shlex.join(study.command(found, best[0][1])))
 

@@ -152,4 +152,4 @@ def test_a_study_without_any_value_is_drawn_all_the_same(tmp_path):
     begin(tmp_path)
     found = study.load(tmp_path)
     found.tell(ask(tmp_path), math.inf)
-    plot_study(found, {"seed": "seed"}, tmp_path / "study.png")
+    plot_study(found, "success rate", {"seed": "seed"}, tmp_path / "study.png")

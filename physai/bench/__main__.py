@@ -61,16 +61,14 @@ def _options() -> argparse.Namespace:
         parser.add_argument(f"--{part}", dest="parts", action="append_const", const=part, help=meaning)
     parser.add_argument("--seed", type=int, default=0, help="seed of all sides (0)")
     parser.add_argument("--seeds", type=int, default=5, help="train so often, with seeds counting up (5)")
-    sb3_frames = "where Stable-Baselines3 gives up; what physai is ahead by is then a lower bound (1,000,000)"
-    parser.add_argument("--sb3-frames", type=int, default=1_000_000, help=sb3_frames)
-    sb3_seconds = "when each algorithm of Stable-Baselines3 gives up in --algorithms (300)"
-    parser.add_argument("--sb3-seconds", type=float, default=300.0, help=sb3_seconds)
+    sb3_seconds = "when Stable-Baselines3 gives up a training; what physai is ahead by is then a lower bound (100)"
+    parser.add_argument("--sb3-seconds", type=float, default=100.0, help=sb3_seconds)
     figure = Path("outputs/growth.png")
     parser.add_argument("--figure", type=Path, default=figure, help=f"where --growth draws ({figure})")
     options = parser.parse_args()
     options.parts = options.parts or list(PARTS)
-    if options.seed < 0 or options.seeds < 1 or min(options.sb3_frames, options.sb3_seconds) <= 0:
-        parser.error("--seed must not be negative, --seeds, --sb3-frames and --sb3-seconds must be positive")
+    if options.seed < 0 or options.seeds < 1 or options.sb3_seconds <= 0:
+        parser.error("--seed must not be negative, --seeds and --sb3-seconds must be positive")
     return options
 
 

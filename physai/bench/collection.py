@@ -14,7 +14,7 @@ from rich.table import Table
 from physai.bench.timing import median_speeds, reacher, table
 from physai.collectors import make_collector
 from physai.envs.make import make_env
-from physai.physics.pybullet import ROBOTS_PER_WORLD
+from physai.physics.pybullet import robots_per_world
 from physai.robots import RobotSpec
 from physai.training.agent import make_actor
 from physai.training.config import TrainConfig
@@ -134,7 +134,8 @@ def bare_loop(spec: RobotSpec, control_dt: float, commands: np.ndarray) -> Itera
         A function that plays all commands and returns the number of robot-steps.
     """
     steps, robots, _ = commands.shape
-    sizes = [min(ROBOTS_PER_WORLD, robots - first) for first in range(0, robots, ROBOTS_PER_WORLD)]
+    most = robots_per_world(spec)
+    sizes = [min(most, robots - first) for first in range(0, robots, most)]
     worlds = [_bare_world(spec, size, control_dt) for size in sizes]
     client, (body, *_) = worlds[0]
     infos = [bullet.getJointInfo(body, joint, client) for joint in range(bullet.getNumJoints(body, client))]

@@ -20,6 +20,7 @@ from physai.training.run import FINAL_SEED, TrainedPolicy
 ROUNDS = 5
 EPISODES = 1000
 TRAINING: tuple[str, ...] = ()  # overrides; how far the policy is decides how long its episodes are
+_LIBRARIES = "import torch, torchrl.envs, pybullet, yourdfpy, hydra"  # what training cannot do without
 _IMPORT = "import physai"
 _HELP = "physai.train --help"
 _FIRST_FRAME = "physai.train, first frame"
@@ -39,10 +40,13 @@ def measure_startup(seed: int) -> dict[str, list[float]]:
     Raises:
         UserError: If training does not start.
     """
-    seconds: dict[str, list[float]] = {name: [] for name in (_IMPORT, _HELP, _FIRST_FRAME, _BUILD, _EVALUATE)}
+    seconds: dict[str, list[float]] = {
+        name: [] for name in (_LIBRARIES, _IMPORT, _HELP, _FIRST_FRAME, _BUILD, _EVALUATE)
+    }
     print(f"Starting each command {ROUNDS} times ...", flush=True)
     for _ in range(ROUNDS):  # they take turns, so that a busy machine slows them alike
-        seconds[_IMPORT].append(_seconds_of("-c", "import physai"))
+        for statement in (_LIBRARIES, _IMPORT):
+            seconds[statement].append(_seconds_of("-c", statement))
         seconds[_HELP].append(_seconds_of("-m", "physai.train", "--help"))
         seconds[_FIRST_FRAME].append(_seconds_to_first_frame(seed))
     print("Training the policy that is judged ...", flush=True)

@@ -1,8 +1,12 @@
 """How soon a policy is trained, against Stable-Baselines3."""
 
 import math
+import multiprocessing
+import os
+import signal
 from argparse import Namespace
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 from rich.table import Table
@@ -77,37 +81,42 @@ def run_race(
 
 def run(options: Namespace) -> Table:
     """Measure, and show it."""
-    return training_table(measure_training(options.seed, options.seeds, options.sb3_frames))
+    return training_table(measure_training(options.seed, options.seeds, options.sb3_seconds))
 
 
-def measure_training(seed: int, seeds: int, sb3_frames: int) -> dict[str, list[Race]]:
-    """Race on one robot that is not randomized: all with these seeds, but Stable-Baselines3's defaults with the first.
+def measure_training(seed: int, seeds: int, sb3_seconds: float) -> dict[str, list[Race]]:
+    """Race on one robot that is not randomized, all with these seeds.
 
     Args:
         seed: The first seed.
         seeds: How many, counting up.
-        sb3_frames: Where Stable-Baselines3 gives up; tuned, it does so when its learning rate has fallen.
+        sb3_seconds: When Stable-Baselines3 gives up; tuned, it also does so when its learning rate has fallen.
 
     Returns:
         By the side's name, its races; physai comes first.
     """
-    configs = [reacher(one, "randomization=none") for one in range(seed, seed + seeds)]
-    sides = (
-        ("SB3, tuned, physai's features", sb3.TUNED_WITH_FEATURES, seeds),
-        ("SB3, tuned", sb3.TUNED, seeds),
-        ("SB3, defaults", sb3.DEFAULTS, 1),
-    )
-    threads = {name: sb3.fastest_threads(name, settings) for name, settings, _ in sides}
-    judge = make_evaluation_env(configs[0], configs[0].randomization, GOALS, GOALS_SEED)
-    races: dict[str, list[Race]] = {"physai": [], **{name: [] for name, _, _ in sides}}
+    ours = {
+        "physai": [],
+        "physai, two processes": ["collector=multi_async", "collector.processes=1"],
+    }
+    theirs = {
+        "SB3, tuned, physai's features": sb3.TUNED_WITH_FEATURES,
+        "SB3, tuned": sb3.TUNED,
+        "SB3, defaults": sb3.DEFAULTS,
+    }
+    threads = {name: sb3.fastest_threads(name, settings) for name, settings in theirs.items()}
+    plain = reacher(seed, "randomization=none")
+    judge = make_evaluation_env(plain, plain.randomization, GOALS, GOALS_SEED)
+    races: dict[str, list[Race]] = {name: [] for name in (*ours, *theirs)}
     try:
-        for number, config in enumerate(configs):  # the sides take turns, so that a busy machine slows them alike
-            races["physai"].append(race_physai(config, Race(f"physai, seed {config.seed}"), judge))
-            for name, settings, count in sides:
-                if number < count:
-                    learner = sb3.Learner(settings, config.seed, threads[name])
-                    end = min(sb3_frames, settings.horizon or sb3_frames)
-                    races[name].append(race_sb3(learner, Race(f"{name}, seed {config.seed}"), judge, max_frames=end))
+        for one in range(seed, seed + seeds):  # the sides take turns, so that a busy machine slows them alike
+            for name, overrides in ours.items():
+                config = reacher(one, "randomization=none", *overrides)
+                races[name].append(race_physai(config, Race(f"{name}, seed {one}"), judge))
+            for name, settings in theirs.items():
+                learner = sb3.Learner(settings, one, threads[name])
+                limits = {"max_seconds": sb3_seconds, "max_frames": settings.horizon or math.inf}
+                races[name].append(race_sb3(learner, Race(f"{name}, seed {one}"), judge, **limits))
         return races
     finally:
         judge.close()
@@ -126,12 +135,26 @@ def race_physai(config: TrainConfig, race: Race, judge: TransformedRobotEnv) -> 
 
     def success_rate() -> float:
         judge.normalization.load_state_dict(agent.env.normalization.state_dict())
-        return evaluate(agent.actor, judge, GOALS, GOALS_SEED).success_rate
+        with _workers_at_rest():
+            return evaluate(agent.actor, judge, GOALS, GOALS_SEED).success_rate
 
     try:
         return run_race(race, learn, success_rate, max_frames=config.total_frames)
     finally:
         agent.close()
+
+
+@contextmanager
+def _workers_at_rest() -> Iterator[None]:
+    """Context in which collecting processes stand still: what they did meanwhile would not be on the clock."""
+    workers = [process.pid for process in multiprocessing.active_children() if process.pid]
+    for worker in workers:
+        os.kill(worker, signal.SIGSTOP)
+    try:
+        yield
+    finally:
+        for worker in workers:
+            os.kill(worker, signal.SIGCONT)
 
 
 def race_sb3(learner: sb3.Learner, race: Race, judge: TransformedRobotEnv, **limits: float) -> Race:

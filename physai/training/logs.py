@@ -2,7 +2,7 @@
 
 import csv
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import IO, Any
 
@@ -65,14 +65,15 @@ class RunLog:
 
     Args:
         run_dir: The run folder.
-        logger: A TorchRL logger.
+        make_logger: Returns a TorchRL logger; called by ``open``, or for the first metrics.
         state: From ``state``, to continue a run.
     """
 
-    def __init__(self, run_dir: Path, logger: Any, state: dict[str, Any] | None = None) -> None:
+    def __init__(self, run_dir: Path, make_logger: Callable[[], Any], state: dict[str, Any] | None = None) -> None:
         state = state or {"metrics": 0, "columns": [], "episodes": 0}
         self._run_dir = run_dir
-        self._logger = logger
+        self._make_logger = make_logger
+        self._logger: Any = None
         self._metrics: CsvLog | None = None
         if state["metrics"]:
             self._metrics = CsvLog(run_dir / "metrics.csv", state["columns"], state["metrics"])
@@ -97,6 +98,11 @@ class RunLog:
             "episode/success_rate": float(success.double().mean()),
         }
 
+    def open(self) -> None:
+        """Make the logger, unless it is there."""
+        if self._logger is None:
+            self._logger = self._make_logger()
+
     def metrics(self, frames: int, iteration: int, values: dict[str, float]) -> None:
         """Write down an iteration."""
         if self._metrics is None:
@@ -107,6 +113,7 @@ class RunLog:
         self._metrics.write(frames=frames, iteration=iteration, **values)
         self._metrics.flush()
         self._episodes.flush()
+        self.open()
         self._logger.log_metrics(values, step=frames)
 
     def state(self) -> dict[str, Any]:
@@ -123,4 +130,5 @@ class RunLog:
         self._episodes.close()
         if self._metrics is not None:
             self._metrics.close()
-        self._logger.close()
+        if self._logger is not None:
+            self._logger.close()

@@ -6,6 +6,7 @@ import signal
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -90,7 +91,7 @@ def _run(
     stop: Sequence[int],
 ) -> None:
     judge = _Judge(config)
-    log = RunLog(run_dir, make_logger(config, run_dir), logged)
+    log = RunLog(run_dir, partial(make_logger, config, run_dir), logged)
     progress = Progress(config.total_frames, clock.frames)
     try:
         if not clock.frames:
@@ -148,6 +149,7 @@ def _loop(
         if done or _due(first_frame, clock.frames, config.evaluation.every_frames):
             result = _evaluate(agent, judge, clock, folder)
             values |= {f"evaluation/{key}": value for key, value in result.items() if isinstance(value, float)}
+        log.open()  # its imports are no part of training
         saving = time.perf_counter()
         log.metrics(clock.frames, clock.iteration, values)
         if done or _due(first_frame, clock.frames, config.checkpoint.every_frames):

@@ -35,7 +35,7 @@ def batch():
 
 
 def test_an_episode_is_written_with_the_frame_at_which_it_ended(tmp_path):
-    log = RunLog(tmp_path, Scalars())
+    log = RunLog(tmp_path, Scalars)
     means = log.episodes(batch(), first_frame=100)
     log.close()
     assert means == {"episode/return": 3.0, "episode/length": 120.0, "episode/success_rate": 0.5}
@@ -46,13 +46,13 @@ def test_an_episode_is_written_with_the_frame_at_which_it_ended(tmp_path):
 
 
 def test_a_resumed_log_forgets_what_came_after_its_checkpoint(tmp_path):
-    log = RunLog(tmp_path, Scalars())
+    log = RunLog(tmp_path, Scalars)
     log.metrics(10, 1, {"loss": 0.5})
     state = log.state()
     log.metrics(20, 2, {"loss": 0.4})
     log.episodes(batch(), first_frame=20)
     log.close()
-    again = RunLog(tmp_path, Scalars(), state)
+    again = RunLog(tmp_path, Scalars, state)
     again.metrics(20, 2, {"loss": 0.3})
     again.close()
     assert [(row["frames"], row["loss"]) for row in rows(tmp_path / "metrics.csv")] == [
@@ -64,10 +64,23 @@ def test_a_resumed_log_forgets_what_came_after_its_checkpoint(tmp_path):
 
 def test_every_value_reaches_the_logger_at_its_frame(tmp_path):
     scalars = Scalars()
-    log = RunLog(tmp_path, scalars)
+    log = RunLog(tmp_path, lambda: scalars)
     log.metrics(10, 1, {"loss": 0.5, "evaluation/success_rate": 1.0})
     log.close()
     assert scalars.rows == [(10, "loss", 0.5), (10, "evaluation/success_rate", 1.0)]
+
+
+def test_a_logger_is_made_once_and_not_before_it_is_needed(tmp_path):
+    made = []
+    log = RunLog(tmp_path, lambda: made.append(Scalars()) or made[-1])
+    log.episodes(batch(), first_frame=0)
+    log.state()
+    assert not made
+    log.open()
+    log.metrics(10, 1, {"loss": 0.5})
+    log.metrics(20, 2, {"loss": 0.4})
+    log.close()
+    assert [len(one.rows) for one in made] == [2]
 
 
 def test_missing_columns_stay_empty(tmp_path):
