@@ -45,7 +45,7 @@ test: $(VENV)/.installed-dev  ## Run all tests (ARGS="-m 'not slow'" for the qui
 	$(BIN)/python -m pytest tests/ros $(ARGS)
 
 bench: $(VENV)/.installed-dev  ## Measure speed against bare PyBullet, rclpy and Stable-Baselines3
-	@echo "==> Measuring (all of it takes an hour; ARGS=--collection and the like choose a part)"
+	@echo "==> Measuring (all of it takes an hour and a half; ARGS=--collection and the like choose a part)"
 	$(BIN)/python -m physai.bench $(ARGS)
 
 check: $(VENV)/.installed-dev  ## Check format, lint and types

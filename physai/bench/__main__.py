@@ -55,7 +55,7 @@ def _options() -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         prog="python -m physai.bench",
         description="Measure physai on the two-link arm, side by side with what it is compared to: the parts that are "
-        "named, or all of them, which takes an hour.",
+        "named, or all of them, which takes an hour and a half.",
     )
     for part, meaning in PARTS.items():
         parser.add_argument(f"--{part}", dest="parts", action="append_const", const=part, help=meaning)
