@@ -81,7 +81,8 @@ def test_diagnostics_come_every_second_and_with_every_change(loop, policy_path):
     loop.peer.wait_state("active")
     since = time.monotonic()
     loop.peer.emergency_stop()
-    level, message, values = loop.diagnosis(after=since)
+    stopped, _ = loop.peer.wait_state("estop", after=since)
+    level, message, values = loop.diagnosis(after=stopped - 0.001)
     assert (level, message) == (2, "estop: emergency stop")
     status = loop.diagnostics[-1][1].status[0]
     assert (status.name, status.hardware_id) == ("inference_node: arm", "planar_arm")
