@@ -136,12 +136,9 @@ def test_are_estimated_where_that_is_allowed(loop, change):
     assert answer.successful, answer.reason
     try:
         loop.arm.change = change
-        slow = "count: policy failures: slow"  # a busy machine's
-        before = int(loop.diagnosis(after=0.0)[2].get(slow, 0))
         since = loop.start_from_here()
         wait_for(lambda: loop.peer.commands[-1][0] > since + 1.0)
-        zeros = [at for at, velocity in loop.peer.commands if since < at < since + 1.0 and not any(velocity)]
-        assert len(zeros) <= int(loop.diagnosis(after=since + 1.0)[2].get(slow, 0)) - before  # no state is refused
+        assert all(any(velocity) for at, velocity in loop.peer.commands if at > since)
     finally:
         loop.peer.set_parameters("/inference_node", allow_velocity_estimate=False)
 
