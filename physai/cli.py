@@ -18,16 +18,18 @@ from pathlib import Path
 from typing import Any
 
 import hydra
+from hydra._internal.callbacks import Callbacks
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
+from hydra.core.utils import run_job
 from hydra.errors import OverrideParseException
-from hydra.types import RunMode
-from omegaconf import DictConfig, OmegaConf, open_dict
+from hydra.types import HydraContext, RunMode
+from omegaconf import DictConfig, OmegaConf, read_write
 from omegaconf.errors import OmegaConfBaseException
 
 from physai import study
-from physai.config import compose, conf_dir, jobs_at_once, set_plugin_defaults
+from physai.config import compose, conf_dir, initialized, jobs_at_once, set_plugin_defaults
 from physai.errors import UserError
 
 _SIGNALS = (signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)
@@ -46,10 +48,27 @@ def main(name: str, job: Job, check: Callable[[DictConfig], object]) -> None:
     flags = [argument for argument in sys.argv[1:] if argument.startswith("-")]
     if set(flags) <= {"-m", "--multirun"}:
         with guard(), _imports():
-            sys.argv += _check_all(name, check, overrides(), sweep=bool(flags))
+            config, pinned = _check_all(name, check, overrides(), sweep=bool(flags))
+        if config.hydra.mode is None and not flags:
+            with guard():
+                _run(name, _guarded(job), config)
+            return
+        sys.argv += pinned
     set_plugin_defaults()
     with guard(), study.without_result():
         hydra.main(version_base="1.3", config_path=str(conf_dir().absolute()), config_name=name)(_guarded(job))()
+
+
+def _run(name: str, job: Callable[[DictConfig], object], config: DictConfig) -> None:
+    """Run one job, like Hydra's main, but with the config that was checked: Hydra would compose it twice more."""
+    with read_write(config.hydra):
+        config.hydra.mode = RunMode.RUN
+    callbacks = Callbacks(config)
+    with initialized(name) as loader:
+        callbacks.on_run_start(config=config, config_name=name)
+        returned = run_job(job, config, "hydra.run.dir", None, HydraContext(loader, callbacks))
+        callbacks.on_run_end(config=config, config_name=name, job_return=returned)
+    returned.return_value  # noqa: B018  # raises what the job has raised
 
 
 def overrides() -> list[str]:
@@ -90,8 +109,15 @@ def _imports() -> Iterator[None]:
         gc.enable()
 
 
-def _check_all(name: str, check: Callable[[DictConfig], object], given: list[str], sweep: bool) -> list[str]:
-    """Check every job to come; return further overrides that pin down what Hydra would choose anew."""
+def _check_all(
+    name: str, check: Callable[[DictConfig], object], given: list[str], sweep: bool
+) -> tuple[DictConfig, list[str]]:
+    """Check every job to come.
+
+    Returns:
+        The config of a single run, or what is common to a sweep's; and further overrides that pin down what Hydra
+        would choose anew.
+    """
     key = "hydra.sweep.dir" if sweep else "hydra.run.dir"
     fixed = [one for one in given if not (sweep and _sweeps(one))]
     whole = compose(name, fixed, hydra=True)
@@ -112,11 +138,11 @@ def _check_all(name: str, check: Callable[[DictConfig], object], given: list[str
     for config in jobs:
         if sweep and launcher.endswith(".RayLauncher") and OmegaConf.select(config, "collector.ray_init"):
             raise UserError("hydra/launcher=ray: a job of Ray's starts no other Ray: choose another collector")
-        with open_dict(config):
-            del config["hydra"]
-        check(config)
+        check(OmegaConf.masked_copy(config, [key for key in config if key != "hydra"]))
+    with read_write(whole.hydra):
+        OmegaConf.update(whole, key, folder)
     if folder == "." and searched is None:
-        return []
+        return whole, []
     if searched is None and any(Path(folder).glob("*/.hydra" if sweep else ".hydra")):
         way_out = f"choose another {key}" if sweep else f"go on with resume={folder}, or choose another {key}"
         raise UserError(f"{folder} holds a run already: {way_out}")
@@ -128,10 +154,10 @@ def _check_all(name: str, check: Callable[[DictConfig], object], given: list[str
         raise UserError(f"cannot write to the run folder {folder}")
     pinned = [f"{key}='{folder}'"]
     if searched is not None:
-        return [*pinned, *study.begin(Path(folder), whole, searched, fixed)]
+        return whole, [*pinned, *study.begin(Path(folder), whole, searched, fixed)]
     if sweep and launcher.endswith(".LocalLauncher") and whole.hydra.sweeper.max_batch_size is None:
         pinned.append(f"hydra.sweeper.max_batch_size={jobs_at_once(whole)}")  # submitit would start all jobs at once
-    return pinned
+    return whole, pinned
 
 
 def _sweeps(override: str) -> bool:

@@ -10,13 +10,15 @@ import os
 import re
 import types
 import typing
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 from hydra import compose as hydra_compose
 from hydra import initialize_config_dir
+from hydra.core.config_loader import ConfigLoader
 from hydra.core.config_store import ConfigStore
+from hydra.core.global_hydra import GlobalHydra
 from hydra.core.plugins import Plugins
 from hydra.errors import HydraException, MissingConfigException, OverrideParseException
 from hydra.plugins.config_source import ConfigLoadError
@@ -130,6 +132,13 @@ def set_plugin_defaults() -> None:
             store.store(path.stem, values, group, provider=plugin.provider)
 
 
+@contextlib.contextmanager
+def initialized(name: str) -> Iterator[ConfigLoader]:
+    """Context in which Hydra finds ``conf/``, for the command ``name``; gives what loads configs there."""
+    with initialize_config_dir(str(conf_dir().absolute()), job_name=name, version_base="1.3"):
+        yield GlobalHydra.instance().config_loader()
+
+
 def compose(name: str, overrides: Iterable[str] = (), hydra: bool = False) -> DictConfig:
     """Compose ``conf/<name>.yaml`` with Hydra overrides.
 
@@ -143,7 +152,7 @@ def compose(name: str, overrides: Iterable[str] = (), hydra: bool = False) -> Di
     """
     overrides = list(overrides)
     set_plugin_defaults()
-    with initialize_config_dir(str(conf_dir().absolute()), version_base="1.3"):
+    with initialized(name):
         try:
             return hydra_compose(name, overrides, return_hydra_config=hydra)
         except MissingConfigException as error:
