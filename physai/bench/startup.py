@@ -20,7 +20,7 @@ from physai.training.run import FINAL_SEED, TrainedPolicy
 ROUNDS = 5
 EPISODES = 1000
 TRAINING: tuple[str, ...] = ()  # overrides; how far the policy is decides how long its episodes are
-_LIBRARIES = "import torch, torchrl.envs, pybullet, yourdfpy, hydra"  # what training cannot do without
+_LIBRARIES = "import torch, torchrl.envs, pybullet, urdf_parser_py.urdf, hydra"  # what training cannot do without
 _IMPORT = "import physai"
 _HELP = "physai.train --help"
 _FIRST_FRAME = "physai.train, first frame"

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from physai.robots.spec import RobotSpec
+from physai.robots.urdf import transform
 
 
 class ForwardKinematics(nn.Module):
@@ -31,10 +32,11 @@ class ForwardKinematics(nn.Module):
         offsets: list[np.ndarray] = []
         fixed = np.eye(4)
         for joint in spec.chain:
-            fixed = fixed @ (np.eye(4) if joint.origin is None else joint.origin)
+            fixed = fixed @ transform(joint.origin)
             if joint.name not in spec.joints:
                 continue
-            x, y, z = joint.axis / np.linalg.norm(joint.axis)
+            axis = np.array(joint.axis or [1.0, 0.0, 0.0])  # what a URDF means that names none
+            x, y, z = axis / np.linalg.norm(axis)
             along = np.outer([x, y, z], [x, y, z])
             across = np.eye(3) - along
             cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])

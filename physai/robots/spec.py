@@ -4,8 +4,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import yourdfpy
 from pydantic import Field
+from urdf_parser_py.urdf import Joint
 
 from physai.config import Config, nearest
 from physai.errors import UserError
@@ -54,7 +54,7 @@ class RobotSpec:
     effort_limit: np.ndarray
     damping: np.ndarray
     friction: np.ndarray
-    chain: tuple[yourdfpy.Joint, ...]
+    chain: tuple[Joint, ...]
     moving_links: tuple[str, ...]
     link_mass: np.ndarray
 
@@ -71,8 +71,7 @@ class RobotSpec:
             UserError: If the URDF is missing or broken, or lacks a joint, link or limit; the line names it.
         """
         path = urdf.resolve(config.urdf)
-        urdf.parse(path)
-        robot = urdf.load(path).robot
+        robot = urdf.load(path)
         links = {link.name: link for link in robot.links}
         by_child = {joint.child: joint for joint in robot.joints}
 
@@ -101,7 +100,7 @@ class RobotSpec:
         for link in moving:
             if link.inertial is None or not link.inertial.mass:
                 raise UserError(f"{path}: link '{link.name}' moves but has no <inertial> with a mass")
-            if link.inertial.inertia is None or not np.linalg.eigvalsh(link.inertial.inertia)[0] > 0:
+            if link.inertial.inertia is None or not np.linalg.eigvalsh(link.inertial.inertia.to_matrix())[0] > 0:
                 raise UserError(f"{path}: link '{link.name}' moves but its inertia is not positive")
         return cls(
             name=config.name,
@@ -121,8 +120,8 @@ class RobotSpec:
         )
 
 
-def _chain(path: Path, link: str, by_child: dict[str, yourdfpy.Joint]) -> list[yourdfpy.Joint]:
-    chain: list[yourdfpy.Joint] = []
+def _chain(path: Path, link: str, by_child: dict[str, Joint]) -> list[Joint]:
+    chain: list[Joint] = []
     while link in by_child:
         joint = by_child[link]
         if joint in chain:
@@ -132,18 +131,18 @@ def _chain(path: Path, link: str, by_child: dict[str, yourdfpy.Joint]) -> list[y
     return chain
 
 
-def _links_below(joint: str, joints: list[yourdfpy.Joint], by_name: dict[str, yourdfpy.Joint]) -> list[str]:
+def _links_below(joint: str, joints: list[Joint], by_name: dict[str, Joint]) -> list[str]:
     below = [by_name[joint].child]
     for link in below:
         below += [other.child for other in joints if other.parent == link]
     return below
 
 
-def _check_driven(path: Path, joint: yourdfpy.Joint) -> None:
+def _check_driven(path: Path, joint: Joint) -> None:
     where = f"{path}: joint '{joint.name}'"
     if joint.type not in ("revolute", "continuous"):
         raise UserError(f"{where} is {joint.type}: only revolute and continuous joints can be driven")
-    if not np.any(joint.axis):
+    if joint.axis is not None and not any(joint.axis):
         raise UserError(f"{where}: its <axis> is zero")
     if joint.limit is None:
         raise UserError(f"{where} has no <limit>: effort and velocity are needed")
@@ -154,11 +153,11 @@ def _check_driven(path: Path, joint: yourdfpy.Joint) -> None:
         raise UserError(f"{where}: its lower limit {lower:g} is not below its upper limit {upper:g}")
 
 
-def _position_limit(joint: yourdfpy.Joint) -> tuple[float, float]:
+def _position_limit(joint: Joint) -> tuple[float, float]:
     if joint.type == "continuous":
         return -np.inf, np.inf
     return float(joint.limit.lower or 0), float(joint.limit.upper or 0)
 
 
-def _dynamics(joint: yourdfpy.Joint, key: str) -> float:
+def _dynamics(joint: Joint, key: str) -> float:
     return float(getattr(joint.dynamics, key, None) or 0)

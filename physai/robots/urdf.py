@@ -1,13 +1,14 @@
-"""Reading a URDF: yourdfpy does the parsing, this module finds what it lets pass and names the culprit."""
+"""Reading a URDF: ROS 2's own parser does it, this module finds what it lets pass and names the culprit."""
 
+import contextlib
 import importlib.resources
-import logging
+import io
 import math
 from pathlib import Path
 
 import numpy as np
-import yourdfpy
 from lxml import etree
+from urdf_parser_py.urdf import Pose, Robot
 
 from physai.errors import UserError
 
@@ -69,13 +70,34 @@ def parse(path: Path) -> etree._ElementTree:
     return tree
 
 
-def load(path: Path) -> yourdfpy.URDF:
-    """Parse a checked URDF without its meshes."""
-    logging.getLogger("yourdfpy").setLevel(logging.ERROR)
+def load(path: Path) -> Robot:
+    """Read the links, with their inertia, and the joints of a URDF; no shapes, and nothing else it may hold.
+
+    Raises:
+        UserError: See :func:`parse`; or something that a URDF must have is missing.
+    """
+    robot = parse(path).getroot()
+    for element in [*robot.xpath("*[not(self::link or self::joint)]"), *robot.xpath("link/*[not(self::inertial)]")]:
+        element.getparent().remove(element)
     try:
-        return yourdfpy.URDF.load(str(path), build_scene_graph=False, load_meshes=False)
-    except (KeyError, ValueError, TypeError, IndexError) as error:
-        raise UserError(f"{path}: not a valid URDF: {' '.join(repr(error).split())}") from None
+        with contextlib.redirect_stderr(io.StringIO()):  # where it names every tag that it does not know
+            return Robot.from_xml_string(etree.tostring(robot))
+    except Exception as error:  # whatever the parser makes of it
+        raise UserError(f"{path}: not a valid URDF: {' '.join(str(error).split()) or type(error).__name__}") from None
+
+
+def transform(origin: Pose | None) -> np.ndarray:
+    """Return the 4 x 4 matrix of an ``<origin>``: roll, pitch and yaw about fixed axes, rad, then the way to go, m."""
+    matrix = np.eye(4)
+    if origin is not None:
+        (cr, cp, cy), (sr, sp, sy) = np.cos(origin.rpy), np.sin(origin.rpy)
+        matrix[:3, :3] = [
+            [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
+            [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
+            [-sp, cp * sr, cp * cr],
+        ]
+        matrix[:3, 3] = origin.xyz
+    return matrix
 
 
 def _named(path: Path, element: etree._Element) -> str:
@@ -111,7 +133,9 @@ def _check_inertial(path: Path, link: etree._Element) -> None:
     mass, inertia = inertial.find("mass"), inertial.find("inertia")
     if mass is None or inertia is None:
         raise UserError(f"{where}: <inertial> needs both <mass> and <inertia>")
-    if float(mass.get("value", "nan")) < 0:
+    if mass.get("value") is None:
+        raise UserError(f"{where}: its <mass> has no value")
+    if float(mass.get("value")) < 0:
         raise UserError(f"{where}: its mass is negative ({mass.get('value')})")
     xx, xy, xz, yy, yz, zz = (float(inertia.get(key, 0)) for key in _NUMERIC["inertia"])
     moments = np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])

@@ -2,8 +2,10 @@ import numpy as np
 import pybullet as bullet
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 
 from physai.robots import ForwardKinematics, RobotConfig, RobotSpec, TipPosition
+from physai.robots.urdf import resolve
 
 SEVEN = [f"lbr_iiwa_joint_{number}" for number in range(1, 8)]
 
@@ -39,9 +41,13 @@ def reference(spec: RobotSpec, joint_position: np.ndarray) -> np.ndarray:
     angles = dict(zip(spec.joints, joint_position, strict=True))
     pose = np.eye(4)
     for joint in spec.chain:
-        pose = pose @ (np.eye(4) if joint.origin is None else joint.origin)
+        if joint.origin is not None:
+            before = np.eye(4)
+            before[:3, :3] = Rotation.from_euler("xyz", joint.origin.rpy).as_matrix()
+            before[:3, 3] = joint.origin.xyz
+            pose = pose @ before
         angle = angles.get(joint.name, 0.0)
-        x, y, z = joint.axis / np.linalg.norm(joint.axis) if joint.axis is not None else (0.0, 0.0, 1.0)
+        x, y, z = np.array(joint.axis) / np.linalg.norm(joint.axis) if joint.axis is not None else (0.0, 0.0, 1.0)
         cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
         turn = np.eye(4)
         turn[:3, :3] = np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
@@ -60,6 +66,18 @@ def linearize(kinematics, joint_position):
 def test_end_effector_is_where_pybullet_has_it_on_a_thousand_poses(spec):
     joint_position = random_positions(1000, len(spec.joints))
     found = ForwardKinematics(spec)(joint_position).numpy()
+    np.testing.assert_allclose(found, link_positions(spec, joint_position.numpy()), rtol=0, atol=1e-5)
+
+
+def test_a_joint_whose_urdf_names_no_axis_turns_about_x_as_pybullet_has_it(reacher, tmp_path):
+    path = tmp_path / "arm.urdf"
+    text = resolve(reacher.robot.urdf).read_text()
+    assert text.count('<axis xyz="0 0 1"/>') == 2
+    path.write_text(text.replace('<axis xyz="0 0 1"/>', "", 1))
+    spec = RobotSpec.from_config(reacher.robot.model_copy(update={"urdf": str(path)}))
+    joint_position = random_positions(100, 2)
+    found = ForwardKinematics(spec)(joint_position).numpy()
+    assert np.abs(found[:, 2]).max() > 0.1  # out of the plane
     np.testing.assert_allclose(found, link_positions(spec, joint_position.numpy()), rtol=0, atol=1e-5)
 
 
@@ -134,7 +152,7 @@ def test_reach_bounds_the_distance_from_the_first_joint_and_is_attained_by_the_p
     for config in (reacher, kuka_reacher):
         spec = RobotSpec.from_config(config.robot)
         kinematics = ForwardKinematics(spec)
-        shoulder = torch.tensor(spec.chain[0].origin[:3, 3], dtype=torch.float32)
+        shoulder = torch.tensor(spec.chain[0].origin.xyz, dtype=torch.float32)
         distance = torch.linalg.vector_norm(kinematics(random_positions(1000, 2)) - shoulder, dim=-1)
         assert distance.max() <= kinematics.reach + 1e-6
     planar = ForwardKinematics(RobotSpec.from_config(reacher.robot))

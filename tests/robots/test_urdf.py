@@ -112,6 +112,7 @@ def test_a_missing_file_in_a_package_is_named():
         (replaced('type="continuous"', 'type="revolute"'), ["joint1", "lower", "upper"]),
         (replaced('<limit velocity="2.5" effort="5.0"/>', ""), ["joint1", "<limit>"]),
         (replaced('effort="3.0"', 'effort="0"'), ["joint2", "effort"]),
+        (replaced('effort="3.0"', ""), ["joint2", "limit", "effort"]),
         (replaced('velocity="2.5"', 'velocity="fast"', 'name="joint2"'), ["joint2", "velocity", "fast"]),
         (
             replaced('<joint name="joint2" type="revolute">', '<joint name="joint2" type="prismatic">'),
