@@ -231,6 +231,15 @@ class Peer:
 
         return wait_for(found, 60.0, "an arm that is told to move")[-1]
 
+    def moved_on(self, after: float, commands: int = 50) -> None:
+        """Wait for so many commands in a row that all move the arm; a stalled computer's pause only starts anew."""
+
+        def found() -> bool:
+            last = self._after(after)[-commands:]
+            return len(last) == commands and all(any(velocity) for velocity in last)
+
+        wait_for(found, 8.0, f"{commands} commands in a row that move the arm")
+
     def first_zeros(self, after: float, timeout: float = 20.0) -> float:
         """Wait for a command of zeros that came after a time, and return how much later it came."""
 

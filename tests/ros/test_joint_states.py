@@ -10,7 +10,6 @@ from sensor_msgs.msg import JointState
 
 from physai.ros import qos
 from tests.ros.loop import Arm, closed_loop
-from tests.ros.peer import wait_for
 
 WITHIN = 0.15  # s
 
@@ -104,8 +103,7 @@ def test_the_arm_moves_on(loop, change):
     loop.rest()
     loop.arm.change = change
     since = loop.start_from_here()
-    wait_for(lambda: loop.peer.commands[-1][0] > since + 1.0)
-    assert all(any(velocity) for at, velocity in loop.peer.commands if at > since)
+    loop.peer.moved_on(after=since)
     assert loop.peer.states[-1][1] == "active"
 
 
@@ -137,8 +135,7 @@ def test_are_estimated_where_that_is_allowed(loop, change):
     try:
         loop.arm.change = change
         since = loop.start_from_here()
-        wait_for(lambda: loop.peer.commands[-1][0] > since + 1.0)
-        assert all(any(velocity) for at, velocity in loop.peer.commands if at > since)
+        loop.peer.moved_on(after=since)
     finally:
         loop.peer.set_parameters("/inference_node", allow_velocity_estimate=False)
 

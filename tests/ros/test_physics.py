@@ -85,10 +85,10 @@ def test_a_caller_who_is_late_gets_whole_periods_again(start_robot, connect):
     home(physics)
     move(physics, [0.1, 0.1], 2)
     time.sleep(0.07)  # on purpose: three periods and a half
-    for _ in range(3):
-        before = time.monotonic()
+    before = time.monotonic()
+    for periods in (1, 2, 3):  # however long a stalled computer makes one of them: the next may make up for that
         move(physics, [0.1, 0.1], 1)
-        assert time.monotonic() - before > 0.015
+        assert time.monotonic() - before >= periods * DT
 
 
 def test_joints_are_mapped_by_name_and_others_ignored(start_robot, connect):
