@@ -6,9 +6,12 @@ import runpy
 import shutil
 import sys
 from pathlib import Path
+from typing import ClassVar
 
 import pytest
 from hydra.core.global_hydra import GlobalHydra
+from hydra.experimental.callback import Callback
+from omegaconf import OmegaConf
 
 from tests.training.small import SMALL, command
 
@@ -193,6 +196,30 @@ def test_resume_refuses_a_truncated_config(run, copied):
     assert code == 2
     assert "the run's config is damaged" in error
     assert len(error.strip().splitlines()) == 1
+
+
+class Heard(Callback):
+    """Notes what Hydra tells its callbacks."""
+
+    events: ClassVar[list[str]] = []
+
+    def __getattribute__(self, name):
+        if name.startswith("on_"):
+            self.events.append(name)
+        return super().__getattribute__(name)
+
+
+def test_a_run_leaves_hydras_files_and_tells_its_callbacks(run, tmp_path):
+    Heard.events.clear()
+    callback = f"+hydra.callbacks.heard._target_={__name__}.Heard"
+    assert run("train", *SMALL, "seed=3", "hydra.run.dir=here", callback)[0] == 0
+    assert Heard.events == ["on_run_start", "on_job_start", "on_job_end", "on_run_end"]
+    assert OmegaConf.load(tmp_path / "here/.hydra/overrides.yaml") == [*SMALL, "seed=3"]
+    assert OmegaConf.load(tmp_path / "here/.hydra/config.yaml").seed == 3
+    hydra = OmegaConf.load(tmp_path / "here/.hydra/hydra.yaml").hydra
+    assert hydra.mode == "RUN"
+    assert hydra.job.name == hydra.job.config_name == "train"
+    assert hydra.runtime.output_dir == str(tmp_path / "here")
 
 
 def test_a_second_run_does_not_overwrite_the_first(run, copied):
