@@ -14,6 +14,7 @@ from physai.physics.interface import DynamicsParameters, nominal_dynamics
 from physai.robots import RobotSpec, urdf
 
 _FIXED_BASE = {"useFixedBase": True, "flags": bullet.URDF_USE_INERTIA_FROM_FILE}
+_APART = 10.0  # m; each pair of robots that could touch costs time in each step, and few arms are longer than 5 m
 
 
 def robots_per_world(spec: RobotSpec) -> int:
@@ -227,7 +228,10 @@ def _make_world(spec: RobotSpec, model: Path, robots: int, time_step: float) -> 
     bullet.setTimeStep(time_step, client)
     bullet.setGravity(0, 0, -9.81, client)
     try:
-        bodies = [bullet.loadURDF(str(model), physicsClientId=client, **_FIXED_BASE) for _ in range(robots)]
+        bodies = [
+            bullet.loadURDF(str(model), basePosition=(_APART * robot, 0, 0), physicsClientId=client, **_FIXED_BASE)
+            for robot in range(robots)
+        ]
     except bullet.error as error:
         bullet.disconnect(client)
         raise UserError(f"{spec.urdf}: PyBullet cannot load it: {error}") from None
