@@ -3,6 +3,7 @@
 import math
 from argparse import Namespace
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import gymnasium
@@ -19,6 +20,7 @@ from physai.robots import RobotSpec
 
 NAME = "physai/Reacher-v0"
 ROBOTS = 64
+PROCESSES = 2
 ROUNDS = 15
 STEPS = 4_000  # of one env in a round; many episodes, so that every round pays for its resets
 STEPS_OF_ALL = 200  # of all robots of a vector env in a round
@@ -91,7 +93,7 @@ def run(options: Namespace) -> Table:
 
 
 def measure_gym(seed: int) -> tuple[list[float], list[float]]:
-    """Return robot-steps/s of the yardstick and of physai: with one robot, and with many."""
+    """Return robot-steps/s of the yardstick and of physai with one robot; and with many, then in processes, too."""
     from stable_baselines3.common.vec_env import DummyVecEnv  # an extra
 
     config = reacher(seed)
@@ -105,13 +107,16 @@ def measure_gym(seed: int) -> tuple[list[float], list[float]]:
     one.close()
     actions = random.uniform(-1, 1, (STEPS_OF_ALL, ROBOTS, 2)).astype(np.float32)
     dummy = DummyVecEnv([lambda: gymnasium.make(NAME)] * ROBOTS)
-    vector = gymnasium.make_vec(NAME, ROBOTS, vectorization_mode="vector_entry_point")
+    make_vector = partial(gymnasium.make_vec, NAME, ROBOTS, vectorization_mode="vector_entry_point")
+    vectors = [make_vector(), make_vector(processes=PROCESSES)]
     dummy.seed(seed)
     dummy.reset()
-    vector.reset(seed=seed)
-    many = median_speeds(*(_played_by_all(env, actions) for env in (dummy, vector)), rounds=ROUNDS)
+    for vector in vectors:
+        vector.reset(seed=seed)
+    many = median_speeds(*(_played_by_all(env, actions) for env in (dummy, *vectors)), rounds=ROUNDS)
     dummy.close()
-    vector.close()
+    for vector in vectors:
+        vector.close()
     return single, many
 
 
@@ -142,7 +147,11 @@ def gym_table(single: list[float], many: list[float]) -> Table:
     shown = table(
         "Gymnasium, robot-steps/s: random actions, resets included", "", "yardstick", "steps/s", "physai", "ratio"
     )
-    rows = {"one robot": ("PyBullet by hand", single), f"{ROBOTS} robots": ("DummyVecEnv of physai's", many)}
+    rows = {
+        "one robot": ("PyBullet by hand", single),
+        f"{ROBOTS} robots": ("DummyVecEnv of physai's", many[:2]),
+        f"{ROBOTS} robots, {PROCESSES} processes": ("DummyVecEnv of physai's", many[::2]),
+    }
     for robots, (yardstick, (theirs, ours)) in rows.items():
         shown.add_row(robots, yardstick, f"{theirs:,.0f}", f"{ours:,.0f}", f"{ours / theirs:.2f}")
     return shown

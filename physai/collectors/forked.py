@@ -1,9 +1,6 @@
 """What collectors whose processes are forked from the learner's have in common."""
 
-import ctypes
 import os
-import signal
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
@@ -19,6 +16,7 @@ from torchrl.collectors import MultiCollector
 from physai.collectors.worker import Acting, MakeEnv, WorkerCollector
 from physai.envs.make import TransformedRobotEnv
 from physai.errors import UserError
+from physai.forked import follow
 from physai.transforms.normalization import Normalizer
 
 
@@ -115,19 +113,10 @@ class RobotMultiCollector(MultiCollector):
 
 
 def _start_worker(learner: int, make_env: MakeEnv, normalizer: Normalizer, worker: int) -> TransformedRobotEnv:
-    # These reach all processes of a terminal or a container; the learner says what comes of it.
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT):
-        signal.signal(number, signal.SIG_IGN)
-    if sys.platform == "linux":  # pipes do not tell that the learner was killed: each worker holds both ends of others'
-        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
-        if os.getppid() != learner:
-            sys.exit(1)
+    follow(learner)
     env = make_env(worker)
     env.normalization.normalizer = normalizer
     return env
-
-
-_PR_SET_PDEATHSIG = 1
 
 
 def _same(policy: TensorDictModuleBase) -> TensorDictModuleBase:

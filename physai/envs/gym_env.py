@@ -18,8 +18,12 @@ from physai.physics.viewer import Viewer, has_screen
 Array = NDArray[Any]
 
 
-def _simulate(env: str, overrides: Sequence[str], num_envs: int) -> Simulation:
+def _simulate(env: str, overrides: Sequence[str], num_envs: int, processes: int = 1) -> Simulation:
     config = validate(EnvConfig, compose("train", [f"env={env}", *overrides]).env)
+    if processes != 1:
+        share = {**config.physics, "_partial_": True}
+        physics = {"_target_": "physai.physics.parallel.ParallelPhysics", "physics": share, "processes": processes}
+        config = config.model_copy(update={"physics": physics})
     return Simulation(config, num_envs, seed=0)
 
 
@@ -99,6 +103,7 @@ class RobotVectorEnv(VectorEnv[Array, Array, Array]):
         num_envs: N.
         render_mode: ``rgb_array`` shows the first robot.
         overrides: Hydra overrides.
+        processes: How many share the physics, with this one; the robots move as in one.
     """
 
     metadata = {  # noqa: RUF012
@@ -108,9 +113,14 @@ class RobotVectorEnv(VectorEnv[Array, Array, Array]):
     }
 
     def __init__(
-        self, env: str, num_envs: int = 1, render_mode: str | None = None, overrides: Sequence[str] = ()
+        self,
+        env: str,
+        num_envs: int = 1,
+        render_mode: str | None = None,
+        overrides: Sequence[str] = (),
+        processes: int = 1,
     ) -> None:
-        self.simulation = _simulate(env, overrides, num_envs)
+        self.simulation = _simulate(env, overrides, num_envs, processes)
         self.metadata = {**self.metadata, "render_fps": round(1 / self.simulation.config.control_dt)}
         self.num_envs = num_envs
         self.render_mode = render_mode

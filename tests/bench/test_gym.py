@@ -45,9 +45,10 @@ def test_both_comparisons_are_measured_and_shown(monkeypatch):
     for name, value in {"ROBOTS": 3, "ROUNDS": 2, "STEPS": 50, "STEPS_OF_ALL": 5}.items():
         monkeypatch.setattr(gym, name, value)
     speeds = gym.measure_gym(seed=0)
-    assert all(len(sides) == 2 and min(sides) > 0 for sides in speeds)
+    assert [len(sides) for sides in speeds] == [2, 3]
+    assert all(min(sides) > 0 for sides in speeds)
     console = Console(width=120, record=True)
     console.print(gym.gym_table(*speeds))
     shown = console.export_text()
-    for part in ("one robot", "by hand", "3 robots", "DummyVecEnv", "ratio"):
+    for part in ("one robot", "by hand", "3 robots", "3 robots, 2 processes", "DummyVecEnv", "ratio"):
         assert part in shown
