@@ -14,7 +14,7 @@ from rich.table import Table
 from physai.bench.timing import median_speeds, reacher, table
 from physai.collectors import make_collector
 from physai.envs.make import make_env
-from physai.physics.pybullet import robots_per_world
+from physai.physics.pybullet import APART, robots_per_world
 from physai.robots import RobotSpec
 from physai.training.agent import make_actor
 from physai.training.config import TrainConfig
@@ -123,7 +123,7 @@ def collectors_table(speeds: dict[str, float]) -> Table:
 
 @contextmanager
 def bare_loop(spec: RobotSpec, control_dt: float, commands: np.ndarray) -> Iterator[Callable[[], int]]:
-    """Make the least that one can do with PyBullet: command, step, read; in worlds as small as physai's.
+    """Make the least that one can do with PyBullet: command, step, read; in worlds like physai's.
 
     Args:
         spec: The robot.
@@ -169,7 +169,7 @@ def _bare_world(spec: RobotSpec, robots: int, time_step: float) -> tuple[int, li
     bullet.setTimeStep(time_step, client)
     bullet.setGravity(0, 0, -9.81, client)
     options = {"useFixedBase": True, "flags": bullet.URDF_USE_INERTIA_FROM_FILE, "physicsClientId": client}
-    bodies = [bullet.loadURDF(str(spec.urdf), **options) for _ in range(robots)]
+    bodies = [bullet.loadURDF(str(spec.urdf), (APART * robot, 0, 0), **options) for robot in range(robots)]
     for body in bodies:
         for link in range(-1, bullet.getNumJoints(body, client)):
             bullet.setCollisionFilterGroupMask(body, link, 0, 0, client)

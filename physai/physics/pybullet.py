@@ -14,14 +14,14 @@ from physai.physics.interface import DynamicsParameters, nominal_dynamics
 from physai.robots import RobotSpec, urdf
 
 _FIXED_BASE = {"useFixedBase": True, "flags": bullet.URDF_USE_INERTIA_FROM_FILE}
-_APART = 10.0  # m; each pair of robots that could touch costs time in each step, and few arms are longer than 5 m
+APART = 10.0  # m; each pair of robots that could touch costs time in each step, and few arms are longer than 5 m
 
 
 def robots_per_world(spec: RobotSpec) -> int:
     """How many robots share a PyBullet client.
 
     A client takes 25 ms and 28 MB to make, so few are wanted; but the cost of a step grows faster than what is in it:
-    with 32 robots instead of 16, two-link arms step 4 percent slower, and arms of seven links 12 percent.
+    with 32 robots instead of 16, two-link arms step 4 percent slower, and arms of seven links 6 percent.
     """
     return 32 if len(spec.moving_links) < 5 else 16
 
@@ -229,7 +229,7 @@ def _make_world(spec: RobotSpec, model: Path, robots: int, time_step: float) -> 
     bullet.setGravity(0, 0, -9.81, client)
     try:
         bodies = [
-            bullet.loadURDF(str(model), basePosition=(_APART * robot, 0, 0), physicsClientId=client, **_FIXED_BASE)
+            bullet.loadURDF(str(model), basePosition=(APART * robot, 0, 0), physicsClientId=client, **_FIXED_BASE)
             for robot in range(robots)
         ]
     except bullet.error as error:
