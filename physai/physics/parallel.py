@@ -1,5 +1,6 @@
 """Robots whose physics several processes compute at the same time."""
 
+import contextlib
 import math
 import mmap
 import multiprocessing
@@ -60,17 +61,17 @@ class ParallelPhysics:
         # Command, position and velocity of all robots, which all processes see: a step sends no more than a sign.
         self._moment = np.frombuffer(mmap.mmap(-1, 8 * math.prod(shape))).reshape(shape)
         self._workers: list[_Worker] = []
-        try:
+        with contextlib.ExitStack() as undo:
+            undo.callback(self._end_workers)
             for share in others:
                 moment = self._moment[:, share[0] : share[-1] + 1]
                 self._workers.append(_Worker(physics, (spec, len(share), control_dt, substeps), moment))
             self._own = physics(spec, len(first), control_dt, substeps)
+            undo.callback(self._own.close)
             self._own_moment = self._moment[:, : len(first)]
             for worker in self._workers:
                 worker.answer()
-        except BaseException:
-            self._end_workers()
-            raise
+            undo.pop_all()
         self._own_moment[1:] = self._own.joint_state()
 
     def _call(self, name: str, arguments: Sequence[tuple[Any, ...] | None], wait: bool = True) -> list[Any]:

@@ -119,16 +119,20 @@ def test_commands_of_another_shape_are_refused_and_nothing_moves(spec, make):
     assert_equal(physics.joint_state(), before)
 
 
-def refuse(spec, robots, control_dt, substeps):
-    if robots < ROBOTS - ROBOTS // 2:  # the worker's share
-        raise UserError("no room")
-    return PyBulletPhysics(spec, robots, control_dt, substeps)
+def test_a_share_that_cannot_be_made_is_told_and_neither_process_nor_world_is_left(spec, children):
+    made = []
 
+    def refuse(spec, robots, control_dt, substeps):
+        if robots < ROBOTS - ROBOTS // 2:  # the worker's share
+            raise UserError("no room")
+        made.append(PyBulletPhysics(spec, robots, control_dt, substeps))
+        return made[-1]
 
-def test_what_a_share_cannot_be_made_of_is_told_and_no_process_is_left(spec, children):
     with pytest.raises(UserError, match="no room"):
         ParallelPhysics(spec, ROBOTS, DT, 1, refuse, 2)
     assert not children()
+    (own,) = made
+    assert not own._worlds
 
 
 def test_a_mistake_in_a_share_reaches_the_caller_and_ends_the_processes(spec, make, children):
