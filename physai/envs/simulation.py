@@ -194,12 +194,12 @@ class Simulation:
     def observe(self) -> np.ndarray:
         """Return what a policy sees of the true state, [N, 2n + 4]: the same as the module ``observation`` makes."""
         columns = self.joint_position.T.astype(float), self.joint_velocity.T, self.end_effector.T, self.goal.T
-        return _table(self.task.observe(self._continuous, *columns))
+        return np.ascontiguousarray(np.array(self.task.observe(self._continuous, *columns)).T, np.float32)
 
     def _read(self, joint_position: np.ndarray, joint_velocity: np.ndarray) -> None:
         self.joint_position = joint_position.astype(np.float32)
         self.joint_velocity = joint_velocity.astype(np.float32)
-        self.end_effector = _table(self._tip.of_many(joint_position))
+        self.end_effector = np.ascontiguousarray(self._tip.of_many(joint_position).T, np.float32)
         error = self.end_effector - self.goal
         self.distance = np.hypot(error[:, :1], error[:, 1:])
 
@@ -230,13 +230,6 @@ class Simulation:
     def close(self) -> None:
         """Free the physics engine."""
         self.physics.close()
-
-
-def _table(columns: Any) -> np.ndarray:
-    table = np.empty((len(columns[0]), len(columns)), np.float32)
-    for index, column in enumerate(columns):  # a third of the time of np.stack
-        table[:, index] = column
-    return table
 
 
 def _replaced(array: np.ndarray, rows: np.ndarray, values: np.ndarray | float) -> np.ndarray:

@@ -91,18 +91,18 @@ class TipPosition:
 
     def __init__(self, kinematics: ForwardKinematics) -> None:
         terms = [kinematics.constant, kinematics.cosine, kinematics.sine]
-        *before, last = np.stack([term[:, :3].double().numpy() for term in terms], axis=1)  # n of [3 terms, 3, 4]
-        self._tip = last[:, :, 3].T  # of the last joint, what the three terms make of the tip: [3, 3 terms]
-        # Of the others, from the tip to the base: where the joint is, for turning moves no origin, and the rows of the
-        # three matrices side by side, [3, 9].
-        joints = [(terms[0, :, 3], np.concatenate(terms[:, :, :3], axis=1)) for terms in before[::-1]]
+        # Joint by joint [4, 3 terms, 4]: what each term makes of a point [x, y, z, 1].
+        motions = np.stack([term[:, :4].double().numpy() for term in terms], axis=2)
+        *before, last = motions
+        joints = before[::-1]  # from the tip to the base
+        self._tip = last[:, :, 3].copy()  # [4, 3 terms]: the tip is the origin of the last link's frame
         if joints:  # the height in the end is not asked for
-            joints[-1] = joints[-1][0][:2], joints[-1][1][:2]
-        else:
-            self._tip = self._tip[:2]
-        self._joints = [(origin[:, None], rows) for origin, rows in joints]
-        self._tip_numbers = self._tip.tolist()
-        self._joint_numbers = [list(zip(origin.tolist(), *rows.T.tolist(), strict=True)) for origin, rows in joints]
+            joints[-1] = joints[-1][:2]
+        self._joints = [np.ascontiguousarray(joint) for joint in joints]
+        self._tip_numbers = self._tip[: 3 if joints else 2].tolist()
+        self._joint_numbers = [  # turning moves no origin
+            [(*constant, *cosine[:3], *sine[:3]) for constant, cosine, sine in joint[:3].tolist()] for joint in joints
+        ]
 
     def of_one(self, joint_position: list[float]) -> list[float]:
         """Map n joint positions, rad, to x and y, m."""
@@ -113,16 +113,18 @@ class TipPosition:
             c, s = math.cos(angle), math.sin(angle)
             point = [
                 at + ax * x + ay * y + az * z + (bx * x + by * y + bz * z) * c + (cx * x + cy * y + cz * z) * s
-                for at, ax, ay, az, bx, by, bz, cx, cy, cz in rows
+                for ax, ay, az, at, bx, by, bz, cx, cy, cz in rows
             ]
         return point
 
     def of_many(self, joint_position: np.ndarray) -> np.ndarray:
         """Map joint positions [N, n], rad, to x and y, m, [2, N]."""
-        cosine, sine = np.cos(joint_position.T), np.sin(joint_position.T)
-        constant, by_cosine, by_sine = self._tip.T[:, :, None]
-        point = constant + by_cosine * cosine[-1] + by_sine * sine[-1]
-        for c, s, (origin, rows) in zip(cosine[-2::-1], sine[-2::-1], self._joints, strict=True):
-            # einsum adds up in the same order for one arm and for many, which matrix products do not.
-            point = origin + np.einsum("ij,jk->ik", rows, np.concatenate([point, point * c, point * s]))
-        return point
+        terms = np.empty((joint_position.shape[1], 3, len(joint_position)))
+        terms[:, 0] = 1.0
+        np.cos(joint_position.T, out=terms[:, 1])
+        np.sin(joint_position.T, out=terms[:, 2])
+        # einsum adds up in the same order for one arm and for many, which matrix products do not.
+        point = np.einsum("it,tk->ik", self._tip, terms[-1])
+        for motion, turned in zip(self._joints, terms[-2::-1], strict=True):
+            point = np.einsum("itj,tk,jk->ik", motion, turned, point)
+        return point[:2]
