@@ -11,7 +11,7 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import multiprocessing
-from torchrl.collectors import MultiCollector
+from torchrl.collectors import MultiCollector, _runner
 
 from physai.collectors.worker import Acting, MakeEnv, WorkerCollector
 from physai.envs.make import TransformedRobotEnv
@@ -119,6 +119,8 @@ def _start_worker(learner: int, make_env: MakeEnv, normalizer: Normalizer, worke
     follow(learner)
     if hasattr(os, "SCHED_BATCH"):  # Linux; whoever is woken does not take the processor from the one that wakes it
         os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
+    # After each batch TorchRL waits for another order, 1 ms long; here, none ever comes before the batch has arrived.
+    _runner._MIN_TIMEOUT = 0.0
     env = make_env(worker)
     env.normalization.normalizer = normalizer
     return env
