@@ -1,29 +1,30 @@
-"""Several processes that collect while the learner learns."""
+"""Processes that collect while the learner learns."""
 
-from collections import deque
 from collections.abc import Iterator
 from queue import Empty
 from typing import Any
 
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from torchrl.collectors import MultiAsyncCollector
 
 from physai.collectors.forked import RobotMultiCollector
 
 
 class RobotMultiAsyncCollector(RobotMultiCollector, MultiAsyncCollector):
-    """TorchRL's collector of several processes, each of which brings whole batches, in the order in which they come.
+    """TorchRL's collector of processes, each of which brings whole batches, in an order that TorchRL leaves to chance.
 
-    Batches are [N / processes, T * processes]: as many frames as elsewhere, all from the robots of one process, which
-    acted throughout as the learner would have when the batch was begun. That is as many updates ago as there are
-    processes. Order, and so the outcome, is the machine's: ``state`` holds all workers between two batches and goes on
-    from there, but not bit for bit; batches that nobody has learnt from are collected anew. The arguments are those of
-    :class:`RobotMultiCollector` and TorchRL's.
+    Here they take turns. A process begins its next batch when the learner takes one from it, and acts throughout as the
+    learner would have then: without what is learnt from the batches that are taken before that next one, as many as
+    there are processes. So the outcome does not depend on who is faster, and the collector continues from ``state``,
+    which holds the batches that wait for the learner, bit for bit.
+
+    Batches are [N / processes, T * processes]: as many frames as elsewhere, all from the robots of one process. The
+    arguments are those of :class:`RobotMultiCollector` and TorchRL's.
     """
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
-        self._ready: deque[tuple[int, int, TensorDictBase]] = deque()
         self._begun, self._ordered = False, 0
+        self._waiting: dict[int, TensorDictBase] = {}  # for the learner, by worker
         super().__init__(*args, **kwargs)
 
     def iterator(self) -> Iterator[TensorDictBase]:
@@ -32,32 +33,56 @@ class RobotMultiAsyncCollector(RobotMultiCollector, MultiAsyncCollector):
         Raises:
             UserError: If a worker has died.
         """
-        self._begun, self._ordered = True, self._frames
-        for worker in range(self.num_workers):
-            self._renew(worker)
-        yield from super().iterator()
+        self._begun = True
+        with self._one_line():
+            for worker in range(self.num_workers):
+                if worker not in self._waiting:
+                    self._order(worker)
+        while self._frames < self.total_frames:
+            worker = self._frames // self.requested_frames_per_batch % self.num_workers
+            with self._one_line():
+                self._receive(worker)
+                batch = self._waiting.pop(worker)
+                self._order(worker)
+            self._frames += batch.numel()
+            yield batch
+
+    def _order(self, worker: int) -> None:
+        """Let a worker that stands still begin a batch."""
+        self._renew(worker)
+        at_random = self._ordered < self.init_random_frames
+        self._ordered += self.requested_frames_per_batch
+        self.pipes[worker].send((worker, "continue_random" if at_random else "continue"))
+
+    def _receive(self, worker: int) -> None:
+        """Wait for a worker's batch."""
+        while worker not in self._waiting:
+            try:
+                sender, _, batch = self._get_from_queue(timeout=1)
+            except Empty:
+                if any(process.exitcode is not None for process in self.procs):
+                    raise RuntimeError("a worker has died") from None
+            else:
+                self._waiting[sender] = batch
 
     @property
     def _queue_len(self) -> int:
         return self.num_workers  # in a shorter queue, batches that have to wait are thrown away
 
-    def _get_from_queue(self, timeout: float | None = None) -> tuple[int, int, TensorDictBase]:
-        worker, number, batch = self._ready.popleft() if self._ready else super()._get_from_queue(timeout)
-        self._renew(worker)  # it waits for its next order, which TorchRL gives now
-        return worker, number, batch
-
-    def _should_use_random_frames(self) -> bool:
-        """Answer for the next batch to be ordered; TorchRL asks once for each, while others are still to come."""
-        self._ordered += self.requested_frames_per_batch
-        return self._ordered <= self.init_random_frames
-
     def state(self) -> dict[str, Any]:
-        """Return the state of all workers, as soon as each has finished its batch."""
-        with self._one_line():
-            while self._begun and len(self._ready) < self.num_workers:
-                try:
-                    self._ready.append(super()._get_from_queue(timeout=1))
-                except Empty:
-                    if any(process.exitcode is not None for process in self.procs):
-                        raise RuntimeError("a worker has died") from None
-        return super().state()
+        """Return the state of all workers, as soon as each has finished its batch, and these batches."""
+        if self._begun:
+            with self._one_line():
+                for worker in range(self.num_workers):
+                    self._receive(worker)
+        waiting = {worker: batch.to_dict(retain_none=False) for worker, batch in self._waiting.items()}
+        return super().state() | {"waiting": waiting}
+
+    def set_state(self, state: dict[str, Any]) -> None:
+        """Restore what ``state`` returned, in a collector made from the same config."""
+        super().set_state(state)
+        self._waiting = {
+            worker: TensorDict(batch, batch_size=batch["action"].shape[:2])
+            for worker, batch in state["waiting"].items()
+        }
+        self._ordered = self._frames + len(self._waiting) * self.requested_frames_per_batch
