@@ -66,6 +66,11 @@ def _ceil_div(number: Any, divisor: Any) -> int:
         return 1
 
 
+def cores() -> int:
+    """How many cores this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 def _cores_of_job(threads: int, processes: int, sync: bool) -> int:
     """Resolver ``${cores_of_job:threads,processes,sync}``: what a run keeps busy; with ``sync``, it takes turns."""
     return max(1, threads, processes) if sync else threads + processes
@@ -73,8 +78,7 @@ def _cores_of_job(threads: int, processes: int, sync: bool) -> int:
 
 def _jobs_at_once(threads: int, processes: int, sync: bool) -> int:
     """Resolver ``${jobs_at_once:threads,processes,sync}``: how many runs this computer's cores are enough for."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return max(1, cores // _cores_of_job(threads, processes, sync))
+    return max(1, cores() // _cores_of_job(threads, processes, sync))
 
 
 def _add(number: int, other: int) -> int:

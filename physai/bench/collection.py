@@ -20,7 +20,7 @@ from physai.training.agent import make_actor
 from physai.training.config import TrainConfig
 
 ROBOTS = (1, 16, 64, 128, 256, 512, 1024)
-COLLECTORS = ("single", "multi_sync", "multi_async", "ray")
+COLLECTORS = ("single", "async", "multi_sync", "multi_async", "ray")
 ROUNDS = 7
 STEPS_PER_ROUND = 112  # longer than most episodes, so that every round pays for its resets
 SMALL = 32  # fewer robots hand over one batch a round: nobody would collect batches of a few frames
@@ -35,7 +35,7 @@ def run(options: Namespace) -> Group:
 
 def measure_collection(seed: int) -> tuple[int, dict[int, list[float]]]:
     """Return the default number of robots; and by their number, robot-steps/s bare, of one process and of two."""
-    config = reacher(seed)
+    config = reacher(seed, "collector=single")  # two processes of which are multi_sync
     torch.set_num_threads(config.threads)
     speeds = {}
     for robots in sorted({*ROBOTS, config.collector.num_envs}):

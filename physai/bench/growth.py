@@ -17,11 +17,12 @@ from physai.errors import UserError
 FRAMES = (131_072, 262_144, 524_288, 1_048_576)
 ROBOTS = (64, 128, 256, 512, 1024)
 ROBOTS_FRAMES = 131_072
+LOOK_EVERY = 0.2  # s; a look takes milliseconds
 
 
 @dataclass(frozen=True)
 class Run:
-    """What one run took: its loop alone, and the most memory that its process ever had."""
+    """What one run took: its loop alone, and the most memory that its processes had together."""
 
     frames: int
     robots: int
@@ -55,8 +56,8 @@ def _run(frames: int, robots: int, seed: int) -> Run:
         with open(Path(folder) / "said.txt", "w+") as said:
             process = subprocess.Popen(command, stdout=said, stderr=subprocess.STDOUT)
             while process.poll() is None:
-                megabytes = max(megabytes, _peak_memory(process.pid))
-                time.sleep(0.05)
+                megabytes = max(megabytes, _memory(process.pid))
+                time.sleep(LOOK_EVERY)
             if process.returncode:
                 said.seek(0)
                 raise UserError(f"training failed: {said.read()[-1000:]}")
@@ -66,13 +67,15 @@ def _run(frames: int, robots: int, seed: int) -> Run:
     return run
 
 
-def _peak_memory(pid: int) -> float:
-    """Most memory that a running process has had, MB."""  # wait4's counts the parent's, which it had at its fork
+def _memory(pid: int) -> float:
+    """Memory of a process and its descendants, MB; what they share counts once."""
+    import psutil  # an extra
+
     try:
-        lines = Path(f"/proc/{pid}/status").read_text().splitlines()
-    except FileNotFoundError:  # it has just ended
+        process = psutil.Process(pid)
+        return sum(one.memory_full_info().pss for one in (process, *process.children(recursive=True))) / 2**20
+    except (psutil.NoSuchProcess, psutil.AccessDenied):  # one has just ended
         return 0.0
-    return next((float(line.split()[1]) / 1024 for line in lines if line.startswith("VmHWM")), 0.0)
 
 
 def growth_table(by_frames: list[Run], by_robots: list[Run]) -> Table:

@@ -20,7 +20,6 @@ from physai.robots import RobotSpec
 
 NAME = "physai/Reacher-v0"
 ROBOTS = 64
-PROCESSES = 2
 ROUNDS = 15
 STEPS = 4_000  # of one env in a round; many episodes, so that every round pays for its resets
 STEPS_OF_ALL = 200  # of all robots of a vector env in a round
@@ -93,7 +92,7 @@ def run(options: Namespace) -> Table:
 
 
 def measure_gym(seed: int) -> tuple[list[float], list[float]]:
-    """Return robot-steps/s of the yardstick and of physai with one robot; and with many, then in processes, too."""
+    """Return robot-steps/s of the yardstick and of physai with one robot; and with many, then in one process."""
     from stable_baselines3.common.vec_env import DummyVecEnv  # an extra
 
     config = reacher(seed)
@@ -108,7 +107,7 @@ def measure_gym(seed: int) -> tuple[list[float], list[float]]:
     actions = random.uniform(-1, 1, (STEPS_OF_ALL, ROBOTS, 2)).astype(np.float32)
     dummy = DummyVecEnv([lambda: gymnasium.make(NAME)] * ROBOTS)
     make_vector = partial(gymnasium.make_vec, NAME, ROBOTS, vectorization_mode="vector_entry_point")
-    vectors = [make_vector(), make_vector(processes=PROCESSES)]
+    vectors = [make_vector(), make_vector(processes=1)]
     dummy.seed(seed)
     dummy.reset()
     for vector in vectors:
@@ -150,7 +149,7 @@ def gym_table(single: list[float], many: list[float]) -> Table:
     rows = {
         "one robot": ("PyBullet by hand", single),
         f"{ROBOTS} robots": ("DummyVecEnv of physai's", many[:2]),
-        f"{ROBOTS} robots, {PROCESSES} processes": ("DummyVecEnv of physai's", many[::2]),
+        f"{ROBOTS} robots, processes=1": ("DummyVecEnv of physai's", many[::2]),
     }
     for robots, (yardstick, (theirs, ours)) in rows.items():
         shown.add_row(robots, yardstick, f"{theirs:,.0f}", f"{ours:,.0f}", f"{ours / theirs:.2f}")

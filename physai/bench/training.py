@@ -97,7 +97,7 @@ def measure_training(seed: int, seeds: int, sb3_seconds: float) -> dict[str, lis
     """
     ours = {
         "physai": [],
-        "physai, two processes": ["collector=multi_async", "collector.processes=1"],
+        "physai, collector=single": ["collector=single"],
     }
     theirs = {
         "SB3, tuned, physai's features": sb3.TUNED_WITH_FEATURES,

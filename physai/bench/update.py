@@ -33,7 +33,8 @@ def measure_update(seed: int) -> tuple[int, dict[int, list[float]]]:
 
 
 def _update_speeds(seed: int, minibatch: int) -> list[float]:
-    config = reacher(seed, f"algo.minibatch_size={minibatch}", f"collector.frames_per_batch={FRAMES}")
+    sizes = f"algo.minibatch_size={minibatch}", f"collector.frames_per_batch={FRAMES}"
+    config = reacher(seed, *sizes, "collector=single")  # nobody else is at work
     agent, twin = Agent.build(config), Agent.build(config)
     try:
         batch = next(iter(agent.collector))

@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Sequence
+from multiprocessing import current_process
 from typing import Any
 
 import gymnasium
@@ -11,11 +12,12 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from physai.config import compose, validate
+from physai.config import compose, cores, validate
 from physai.envs.simulation import EnvConfig, Simulation
 from physai.physics.viewer import Viewer, has_screen
 
 Array = NDArray[Any]
+_WORTH_A_PROCESS = 32  # robots; with fewer, a step takes little longer than handing it over
 
 
 def _simulate(env: str, overrides: Sequence[str], num_envs: int, processes: int = 1) -> Simulation:
@@ -95,15 +97,21 @@ class RobotGymEnv(gymnasium.Env[Array, Array]):
             self._viewer = None
 
 
+def _fastest_processes(num_envs: int) -> int:
+    """How many processes are worth their while; where there may be none (``daemon``), one."""
+    return 1 if current_process().daemon else max(1, min(cores(), num_envs // _WORTH_A_PROCESS))
+
+
 class RobotVectorEnv(VectorEnv[Array, Array, Array]):
-    """N robots in one process as a Gymnasium vector env; an episode that is over restarts at the next step.
+    """N robots as a Gymnasium vector env; an episode that is over restarts at the next step.
 
     Args:
         env: A file of ``conf/env``.
         num_envs: N.
         render_mode: ``rgb_array`` shows the first robot.
         overrides: Hydra overrides.
-        processes: How many share the physics, with this one; the robots move as in one.
+        processes: How many share the physics, with this one, and move the robots as one would; by default, one for each
+            core that has 32 robots to move.
     """
 
     metadata = {  # noqa: RUF012
@@ -118,9 +126,9 @@ class RobotVectorEnv(VectorEnv[Array, Array, Array]):
         num_envs: int = 1,
         render_mode: str | None = None,
         overrides: Sequence[str] = (),
-        processes: int = 1,
+        processes: int | None = None,
     ) -> None:
-        self.simulation = _simulate(env, overrides, num_envs, processes)
+        self.simulation = _simulate(env, overrides, num_envs, processes or _fastest_processes(num_envs))
         self.metadata = {**self.metadata, "render_fps": round(1 / self.simulation.config.control_dt)}
         self.num_envs = num_envs
         self.render_mode = render_mode

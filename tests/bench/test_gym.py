@@ -50,5 +50,5 @@ def test_both_comparisons_are_measured_and_shown(monkeypatch):
     console = Console(width=120, record=True)
     console.print(gym.gym_table(*speeds))
     shown = console.export_text()
-    for part in ("one robot", "by hand", "3 robots", "3 robots, 2 processes", "DummyVecEnv", "ratio"):
+    for part in ("one robot", "by hand", "3 robots", "3 robots, processes=1", "DummyVecEnv", "ratio"):
         assert part in shown

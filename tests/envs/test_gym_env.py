@@ -215,6 +215,24 @@ def test_looking_does_not_disturb_the_simulation(make):
     np.testing.assert_array_equal(*seen)
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="cores are taken away as Linux does it")
+def test_a_vector_env_keeps_as_many_cores_busy_as_have_32_robots_to_move_if_it_is_not_told_otherwise():
+    in_fresh_python(
+        "import os, gymnasium, physai\n"
+        "from multiprocessing import active_children\n"
+        "def others(num_envs, **options):\n"
+        "    envs = gymnasium.make_vec('physai/Reacher-v0', num_envs, 'vector_entry_point', **options)\n"
+        "    count = len(active_children())\n"
+        "    envs.close()\n"
+        "    return count\n"
+        "assert others(63) == others(64, processes=1) == 0\n"
+        "assert others(64) == min(2, len(os.sched_getaffinity(0))) - 1\n"
+        "os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})\n"
+        "assert others(64) == 0\n"
+        "assert others(64, processes=2) == 1\n"
+    )
+
+
 def test_a_vector_env_renders_its_first_robot(make):
     env = make(IDS[0], 2, render_mode="rgb_array")
     env.reset(seed=0)
