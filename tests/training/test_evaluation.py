@@ -8,7 +8,7 @@ from tests.training.small import small_config
 
 @pytest.fixture(scope="module")
 def trained():
-    config = small_config()
+    config = small_config("collector=single")  # of whose robots evaluation could make use
     agent = Agent.build(config)
     agent.env.normalization.update(torch.randn(100, 8))
     env = make_evaluation_env(config, config.randomization, 8, seed=1)
