@@ -156,7 +156,8 @@ def test_of_a_joint_that_counts_from_minus_pi_to_pi_lead_around_the_corner(polic
         loop.arm.change = wrapped
         loop.arm.position = [-2.8, 0.8]
         loop.peer.wait_state("waiting", "hold")
-        loop.peer.send_goal(0.4 * math.cos(2.6), 0.4 * math.sin(2.6))
+        # Within 5 cm of this goal, joint1 is past the corner with either elbow; which one is the policy's own choice.
+        loop.peer.send_goal(0.4 * math.cos(2.2), 0.4 * math.sin(2.2))
         loop.peer.wait_state("reached")
         assert loop.arm.position[0] < -math.pi
         seen = [message.position[0] for _, message in loop.peer.joint_states]
