@@ -57,6 +57,8 @@ NonNegativeFloat = Annotated[float, Field(ge=0)]
 
 C = TypeVar("C", bound=Config)
 
+_CPU_MAX = Path("/sys/fs/cgroup/cpu.max")  # of a container: microseconds in each period of so many, or "max"
+
 
 def _ceil_div(number: Any, divisor: Any) -> int:
     """Resolver ``${ceil_div:a,b}``; nonsense gives 1, for the key that holds it gets the blame when it is validated."""
@@ -67,8 +69,13 @@ def _ceil_div(number: Any, divisor: Any) -> int:
 
 
 def cores() -> int:
-    """How many cores this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    """How many cores this process may keep busy: those that it may run on, or its container's share of them."""
+    allowed = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    try:
+        quota, period = _CPU_MAX.read_text().split()
+        return max(1, min(allowed, int(quota) // int(period)))
+    except (OSError, ValueError):  # no container, or one without a limit ("max")
+        return allowed
 
 
 def _cores_of_job(threads: int, processes: int, sync: bool) -> int:

@@ -1,10 +1,12 @@
 """Every file in ``conf/`` composes into a valid config; walking the folders tests what is added."""
 
+import os
 from pathlib import Path
 
 import pytest
 from omegaconf import OmegaConf
 
+import physai.config
 from physai.config import compose, conf_dir, validate
 from physai.errors import UserError
 from physai.policies import GaussianActor
@@ -73,6 +75,7 @@ def test_sb3_defaults_are_the_well_known_numbers():
         0.5,
     )
     assert (config.collector.num_envs, config.collector.frames_per_batch) == (4, 4 * 2048)
+    assert config.collector.here  # no batch is older than the policy
     assert algo["minibatch_size"] == 64
     assert algo["scheduler"] is None
     assert (config.total_frames, config.evaluation.every_frames, config.checkpoint.every_frames) == (
@@ -110,6 +113,17 @@ class Rememberer(GaussianActor):
 def test_a_run_that_collects_while_it_learns_keeps_one_more_core_busy(processes, sync, cores):
     node = OmegaConf.create({"cores": f"${{cores_of_job:1,{processes},{sync}}}"})
     assert node.cores == cores
+
+
+@pytest.mark.parametrize(
+    ("limit", "cores"),
+    [("150000 100000", 1), ("100 100000", 1), ("400000 100000", 4), ("2000000 100000", 8), ("max 100000", 8), ("", 8)],
+)
+def test_a_container_s_share_of_the_cores_is_all_that_there_is(monkeypatch, tmp_path, limit, cores):
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(8)), raising=False)
+    (tmp_path / "cpu.max").write_text(limit)
+    monkeypatch.setattr(physai.config, "_CPU_MAX", tmp_path / "cpu.max")
+    assert physai.config.cores() == cores
 
 
 def test_counts_may_be_written_as_people_write_them():

@@ -1,5 +1,6 @@
 """Starting to train: heavy imports only where they are needed, and nothing is built twice."""
 
+import multiprocessing
 import subprocess
 import sys
 
@@ -90,6 +91,7 @@ def test_the_jobs_of_a_sweep_build_their_own_and_its_check_keeps_no_robots(train
     for node in nodes:
         command.check(node)
     assert [agent.env.simulation.physics._worlds for agent in built] == [[], []]
+    assert not multiprocessing.active_children()
     for node in nodes:
         command.train(node, tmp_path)
     assert trained == [None, None]

@@ -31,6 +31,7 @@ NEEDS = {  # the extra that a part needs, and its modules
     "training": ("bench", ["stable_baselines3"]),
     "algorithms": ("bench", ["stable_baselines3"]),
     "collection": ("ray", ["ray"]),
+    "growth": ("bench", ["psutil"]),
 }
 
 

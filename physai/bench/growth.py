@@ -9,6 +9,7 @@ from argparse import Namespace
 from dataclasses import dataclass
 from pathlib import Path
 
+import psutil
 from rich.table import Table
 
 from physai.bench.timing import reacher, table
@@ -55,9 +56,13 @@ def _run(frames: int, robots: int, seed: int) -> Run:
         megabytes = 0.0
         with open(Path(folder) / "said.txt", "w+") as said:
             process = subprocess.Popen(command, stdout=said, stderr=subprocess.STDOUT)
-            while process.poll() is None:
-                megabytes = max(megabytes, _memory(process.pid))
-                time.sleep(LOOK_EVERY)
+            try:
+                while process.poll() is None:
+                    megabytes = max(megabytes, _memory(process.pid))
+                    time.sleep(LOOK_EVERY)
+            finally:
+                process.kill()  # unless it has ended
+                process.wait()
             if process.returncode:
                 said.seek(0)
                 raise UserError(f"training failed: {said.read()[-1000:]}")
@@ -69,8 +74,6 @@ def _run(frames: int, robots: int, seed: int) -> Run:
 
 def _memory(pid: int) -> float:
     """Memory of a process and its descendants, MB; what they share counts once."""
-    import psutil  # an extra
-
     try:
         process = psutil.Process(pid)
         return sum(one.memory_full_info().pss for one in (process, *process.children(recursive=True))) / 2**20

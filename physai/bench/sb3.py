@@ -27,7 +27,7 @@ Array = NDArray[Any]
 
 
 class RobotVecEnv(VecEnv):
-    """N robots in one process, as Stable-Baselines3 wants them: an episode that is over restarts in the same step.
+    """Our vector env as Stable-Baselines3 wants it: an episode that is over restarts in the same step.
 
     Args:
         robots: They belong to this env, and are stepped by it alone.

@@ -1,10 +1,12 @@
 """What collectors whose processes are forked from the learner's have in common."""
 
 import os
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
 from functools import partial
 from multiprocessing import connection
+from multiprocessing.process import BaseProcess
+from multiprocessing.util import Finalize
 from typing import Any
 
 import torch
@@ -16,7 +18,7 @@ from torchrl.collectors import MultiCollector, _runner
 from physai.collectors.worker import Acting, MakeEnv, WorkerCollector
 from physai.envs.make import TransformedRobotEnv
 from physai.errors import UserError
-from physai.forked import follow
+from physai.forked import follow, signals_wait
 from physai.transforms.normalization import Normalizer
 
 
@@ -47,10 +49,11 @@ class RobotMultiCollector(MultiCollector):
         # The tensors themselves: load_state_dict would take half a millisecond of every batch.
         self._weights, *self._weights_of = (list(one.state_dict().values()) for one in (self._acting, *self._copies))
         threads, method = torch.get_num_threads(), multiprocessing.get_start_method(allow_none=True)
+        before = set(multiprocessing.active_children())
         # Forked workers start at once; fresh ones would import for seconds.
         multiprocessing.set_start_method("fork", force=True)
         try:
-            with self._one_line():
+            with signals_wait(), self._one_line():
                 super().__init__(
                     [
                         partial(_start_worker, os.getpid(), make_env, copy.normalizer, worker)
@@ -62,6 +65,10 @@ class RobotMultiCollector(MultiCollector):
                     auto_register_policy_transforms=False,
                     **torchrl,
                 )
+                Finalize(self, _kill, (self.procs,), exitpriority=0)  # where a signal leaves no time for a shutdown
+        except BaseException:  # a signal, too: they take no notice of it, and Python would wait for them
+            _kill(set(multiprocessing.active_children()) - before)
+            raise
         finally:
             multiprocessing.set_start_method(method, force=True)
             torch.set_num_threads(threads)  # those are the learner's: TorchRL takes one away for each worker
@@ -99,8 +106,7 @@ class RobotMultiCollector(MultiCollector):
                 if process.sentinel in gone:  # of a process that dies, a pipe breaks first; its exit code comes last
                     process.join(timeout=1)
             codes = [str(process.exitcode) for process in open_ones if process.exitcode is not None]
-            for process in open_ones:
-                process.kill()
+            _kill(open_ones)
             reason = f"exit code {', '.join(codes)}" if codes else (str(error) or type(error).__name__).splitlines()[0]
             raise UserError(f"a process that collects has ended ({reason})") from error
 
@@ -118,12 +124,19 @@ class RobotMultiCollector(MultiCollector):
 def _start_worker(learner: int, make_env: MakeEnv, normalizer: Normalizer, worker: int) -> TransformedRobotEnv:
     follow(learner)
     if hasattr(os, "SCHED_BATCH"):  # Linux; whoever is woken does not take the processor from the one that wakes it
-        os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
+        with suppress(OSError):  # where that is not allowed, it is a little slower
+            os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
     # After each batch TorchRL waits for another order, 1 ms long; here, none ever comes before the batch has arrived.
     _runner._MIN_TIMEOUT = 0.0
     env = make_env(worker)
     env.normalization.normalizer = normalizer
     return env
+
+
+def _kill(processes: Iterable[BaseProcess]) -> None:
+    for process in processes:
+        with suppress(ValueError):  # closed, as one that ended in good order
+            process.kill()
 
 
 def _same(policy: TensorDictModuleBase) -> TensorDictModuleBase:

@@ -19,8 +19,8 @@ from physai.seeding import derive
 class CollectorConfig(Config):
     """One file of ``conf/collector``; ``num_envs`` and ``frames_per_batch`` are those of all processes together.
 
-    One process that others would wait for (``sync``) is the learner's own; others are forked from it, or, with
-    ``ray_init``, arguments of ``ray.init``, started by Ray.
+    With ``sync``, the learner waits for each batch, and a single process is its own. All others are forked from it or,
+    with ``ray_init``, arguments of ``ray.init``, started by Ray.
     """
 
     num_envs: Count

@@ -14,9 +14,9 @@ class RobotMultiAsyncCollector(RobotMultiCollector, MultiAsyncCollector):
     """TorchRL's collector of processes, each of which brings whole batches, in an order that TorchRL leaves to chance.
 
     Here they take turns. A process begins its next batch when the learner takes one from it, and acts throughout as the
-    learner would have then: without what is learnt from the batches that are taken before that next one, as many as
-    there are processes. So the outcome does not depend on who is faster, and the collector continues from ``state``,
-    which holds the batches that wait for the learner, bit for bit.
+    learner would have then, so that a batch misses as many updates as there are processes. The outcome does not depend
+    on who is faster, and the collector continues from ``state``, which holds the batches that wait for the learner, bit
+    for bit.
 
     Batches are [N / processes, T * processes]: as many frames as elsewhere, all from the robots of one process. The
     arguments are those of :class:`RobotMultiCollector` and TorchRL's.
@@ -33,11 +33,11 @@ class RobotMultiAsyncCollector(RobotMultiCollector, MultiAsyncCollector):
         Raises:
             UserError: If a worker has died.
         """
-        self._begun = True
         with self._one_line():
             for worker in range(self.num_workers):
-                if worker not in self._waiting:
+                if not self._begun and worker not in self._waiting:
                     self._order(worker)
+        self._begun = True
         while self._frames < self.total_frames:
             worker = self._frames // self.requested_frames_per_batch % self.num_workers
             with self._one_line():

@@ -1,5 +1,6 @@
 """The Gymnasium shells: one robot, or N as one vector env; neither needs TorchRL."""
 
+import threading
 import time
 from collections.abc import Sequence
 from multiprocessing import current_process
@@ -98,8 +99,9 @@ class RobotGymEnv(gymnasium.Env[Array, Array]):
 
 
 def _fastest_processes(num_envs: int) -> int:
-    """How many processes are worth their while; where there may be none (``daemon``), one."""
-    return 1 if current_process().daemon else max(1, min(cores(), num_envs // _WORTH_A_PROCESS))
+    """How many processes are worth their while; one, where others may not start, or would end with a thread."""
+    alone = current_process().daemon or threading.current_thread() is not threading.main_thread()
+    return 1 if alone else max(1, min(cores(), num_envs // _WORTH_A_PROCESS))
 
 
 class RobotVectorEnv(VectorEnv[Array, Array, Array]):
@@ -110,8 +112,8 @@ class RobotVectorEnv(VectorEnv[Array, Array, Array]):
         num_envs: N.
         render_mode: ``rgb_array`` shows the first robot.
         overrides: Hydra overrides.
-        processes: How many share the physics, with this one, and move the robots as one would; by default, one for each
-            core that has 32 robots to move.
+        processes: How many share the physics, with this one, and move the robots as one would; on Linux, they end with
+            the thread that makes the env. By default, one for each core that has 32 robots to move; in a thread, one.
     """
 
     metadata = {  # noqa: RUF012
@@ -128,7 +130,9 @@ class RobotVectorEnv(VectorEnv[Array, Array, Array]):
         overrides: Sequence[str] = (),
         processes: int | None = None,
     ) -> None:
-        self.simulation = _simulate(env, overrides, num_envs, processes or _fastest_processes(num_envs))
+        if processes is None:
+            processes = _fastest_processes(num_envs)
+        self.simulation = _simulate(env, overrides, num_envs, processes)
         self.metadata = {**self.metadata, "render_fps": round(1 / self.simulation.config.control_dt)}
         self.num_envs = num_envs
         self.render_mode = render_mode

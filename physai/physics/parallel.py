@@ -11,6 +11,7 @@ import signal
 import time
 from collections.abc import Callable, Sequence
 from multiprocessing.connection import Connection
+from multiprocessing.util import Finalize
 from typing import Any, ClassVar
 
 import numpy as np
@@ -61,8 +62,9 @@ class ParallelPhysics:
         # Command, position and velocity of all robots, which all processes see: a step sends no more than a sign.
         self._moment = np.frombuffer(mmap.mmap(-1, 8 * math.prod(shape))).reshape(shape)
         self._workers: list[_Worker] = []
+        Finalize(self, _end, (self._workers,))  # of physics that nobody closes; not that of its copy in a fork
         with contextlib.ExitStack() as undo:
-            undo.callback(self._end_workers)
+            undo.callback(_end, self._workers)
             for share in others:
                 moment = self._moment[:, share[0] : share[-1] + 1]
                 self._workers.append(_Worker(physics, (spec, len(share), control_dt, substeps), moment))
@@ -147,12 +149,13 @@ class ParallelPhysics:
 
     def close(self) -> None:
         """See :meth:`physai.physics.Physics.close`."""
-        self._end_workers()
+        _end(self._workers)
         self._own.close()
 
-    def _end_workers(self) -> None:
-        while self._workers:
-            self._workers.pop().end()
+
+def _end(workers: list["_Worker"]) -> None:
+    while workers:
+        workers.pop().end()
 
 
 def _do(physics: Physics, moment: np.ndarray, name: str, arguments: tuple[Any, ...]) -> Any:
@@ -169,7 +172,7 @@ class _Worker:
     def __init__(self, physics: Callable[..., Physics], arguments: tuple[Any, ...], moment: np.ndarray) -> None:
         context = multiprocessing.get_context("fork")  # at once; a fresh process would import for seconds
         self._connection, theirs = context.Pipe()
-        serve = os.getpid(), theirs, physics, arguments, moment
+        serve = os.getpid(), self._connection, theirs, physics, arguments, moment
         self._process = context.Process(target=_serve, args=serve, daemon=True)
         self._process.start()
         theirs.close()
@@ -203,11 +206,13 @@ class _Worker:
 
 def _serve(
     parent: int,
+    parents: Connection,
     connection: Connection,
     physics: Callable[..., Physics],
     arguments: tuple[Any, ...],
     moment: np.ndarray,
 ) -> None:
+    parents.close()  # which would otherwise keep this end from ever seeing an end
     follow(parent)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)  # by which Python ends what was not closed
     try:

@@ -9,6 +9,7 @@ from physai.policies import GaussianActor
 RAY = {"address": "local", "include_dashboard": False, "log_to_driver": False, "logging_level": "error"}
 KINDS = {
     "single": {"processes": 1, "sync": True, "ray_init": None},
+    "async": {"processes": 1, "sync": False, "ray_init": None},
     "multi_sync": {"processes": 2, "sync": True, "ray_init": None},
     "multi_async": {"processes": 2, "sync": False, "ray_init": None},
     "ray": {"processes": 2, "sync": True, "ray_init": RAY},

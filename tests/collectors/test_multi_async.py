@@ -10,6 +10,8 @@ import torch
 from physai.errors import UserError
 from tests.collectors import parts
 
+KINDS = pytest.mark.parametrize("kind", ["async", "multi_async"])
+
 
 def goes_on(before, after):
     """Whether a batch begins where another ended: its robots are in the middle of the same episodes."""
@@ -51,8 +53,9 @@ def test_the_same_seed_gives_the_same_batches_whoever_is_faster(collect):
         parts.assert_equal(one, other)
 
 
-def test_one_set_of_weights_and_statistics_holds_for_a_whole_batch_and_they_are_two_updates_old(collect):
-    source, actor, normalization = collect("multi_async", total=2048)
+@KINDS
+def test_one_set_of_weights_and_statistics_holds_for_a_whole_batch_and_misses_an_update_per_process(collect, kind):
+    source, actor, normalization = collect(kind, total=2048)
     past = []
     for number, batch in enumerate(source):
         past.append((actor.state_dict(), normalization.normalizer.state_dict()))
@@ -67,7 +70,7 @@ def test_one_set_of_weights_and_statistics_holds_for_a_whole_batch_and_they_are_
                 fitting.append(version)
         actor.load_state_dict(now[0])
         normalization.normalizer.load_state_dict(now[1])
-        assert fitting == [max(0, number - 2)]  # as many updates as there are processes
+        assert fitting == [max(0, number - parts.KINDS[kind]["processes"])]
         normalization.update(batch["observation"])
         with torch.no_grad():
             for parameter in actor.parameters():
@@ -75,24 +78,34 @@ def test_one_set_of_weights_and_statistics_holds_for_a_whole_batch_and_they_are_
     assert number == 15
 
 
-def test_asking_for_the_state_loses_no_frame_and_stops_nobody(collect):
+def test_asking_for_the_state_loses_no_frame(collect):
     source, *_ = collect("multi_async")
     batches = []
     for batch in source:
         batches.append(batch.clone())
         source.state()
     assert len(batches) == 8
-    # Each of the two processes has been collecting all the time, without a gap.
     assert all(goes_on(before, after) for before, after in zip(batches, batches[2:], strict=False))
 
 
-def test_state_continues_bit_for_bit_in_new_processes(collect):
-    expected = learn(*collect("multi_async", seed=3))
-    source, actor, normalization = collect("multi_async", seed=3)
+@KINDS
+def test_a_loop_that_is_left_goes_on_in_the_next_as_if_it_had_not_been(collect, kind):
+    expected = learn(*collect(kind, seed=4))
+    source, actor, normalization = collect(kind, seed=4)
+    batches = learn(source, actor, normalization, batches=3) + learn(source, actor, normalization)
+    assert len(batches) == 8
+    for one, same in zip(expected, batches, strict=True):
+        parts.assert_equal(one, same)
+
+
+@KINDS
+def test_state_continues_bit_for_bit_in_new_processes(collect, kind):
+    expected = learn(*collect(kind, seed=3))
+    source, actor, normalization = collect(kind, seed=3)
     learn(source, actor, normalization, batches=3)
     state, weights, statistics = source.state(), actor.state_dict(), normalization.state_dict()
     assert state["frames"] == 3 * 128
-    other, actor, normalization = collect("multi_async", seed=99)
+    other, actor, normalization = collect(kind, seed=99)
     actor.load_state_dict(weights)
     normalization.load_state_dict(statistics)
     other.set_state(state)

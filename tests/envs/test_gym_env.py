@@ -11,6 +11,7 @@ from gymnasium.vector import AutoresetMode
 from stable_baselines3.common.env_checker import check_env as check_env_sb3
 
 import physai
+from physai.errors import UserError
 
 IDS = ["physai/Reacher-v0", "physai/KukaReacher-v0"]
 
@@ -219,6 +220,7 @@ def test_looking_does_not_disturb_the_simulation(make):
 def test_a_vector_env_keeps_as_many_cores_busy_as_have_32_robots_to_move_if_it_is_not_told_otherwise():
     in_fresh_python(
         "import os, gymnasium, physai\n"
+        "from concurrent.futures import ThreadPoolExecutor\n"
         "from multiprocessing import active_children\n"
         "def others(num_envs, **options):\n"
         "    envs = gymnasium.make_vec('physai/Reacher-v0', num_envs, 'vector_entry_point', **options)\n"
@@ -227,10 +229,16 @@ def test_a_vector_env_keeps_as_many_cores_busy_as_have_32_robots_to_move_if_it_i
         "    return count\n"
         "assert others(63) == others(64, processes=1) == 0\n"
         "assert others(64) == min(2, len(os.sched_getaffinity(0))) - 1\n"
+        "assert ThreadPoolExecutor().submit(others, 64).result() == 0\n"  # they would end with the thread
         "os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})\n"
         "assert others(64) == 0\n"
         "assert others(64, processes=2) == 1\n"
     )
+
+
+def test_a_vector_env_in_no_process_is_refused(make):
+    with pytest.raises(UserError, match="processes"):
+        make(IDS[0], 2, processes=0)
 
 
 def test_a_vector_env_renders_its_first_robot(make):

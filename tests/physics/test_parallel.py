@@ -1,3 +1,4 @@
+import gc
 import multiprocessing
 import os
 import signal
@@ -162,6 +163,34 @@ def test_closing_ends_the_processes_and_may_happen_twice(spec, make, children):
     physics.close()
     physics.close()
     assert not children()
+
+
+def test_physics_that_nobody_closes_takes_its_processes_along(spec, children):
+    physics = ParallelPhysics(spec, ROBOTS, DT, 1, PyBulletPhysics, 3)
+    assert len(children()) == 2
+    del physics
+    gc.collect()
+    assert not children()
+
+
+def test_a_copy_in_a_fork_leaves_the_processes_alone(spec):
+    physics = ParallelPhysics(spec, ROBOTS, DT, 1, PyBulletPhysics, 2)
+    child = os.fork()
+    if child == 0:
+        del physics
+        gc.collect()
+        os._exit(0)
+    assert os.waitpid(child, 0)[1] == 0
+    physics.step(np.zeros((ROBOTS, len(spec.joints))))
+    physics.close()
+
+
+def test_a_process_that_nobody_can_ask_any_more_ends_by_itself(spec, make):
+    physics = make(spec, 2)
+    (worker,) = physics._workers
+    worker._connection.close()
+    worker._process.join(timeout=10)
+    assert worker._process.exitcode == 0
 
 
 @pytest.mark.parametrize("end", ["", "os.kill(os.getpid(), signal.SIGKILL)"], ids=["ends", "is killed"])

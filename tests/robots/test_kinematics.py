@@ -170,6 +170,15 @@ def assert_same_in_numbers_and_arrays(spec):
     np.testing.assert_allclose([tip.of_one(row) for row in q.tolist()], expected, rtol=0, atol=1e-12)
 
 
+def test_the_tip_of_a_robot_is_to_the_last_bit_where_it_would_be_without_the_others(spec):
+    tip = TipPosition(ForwardKinematics(spec))
+    q = random_positions(64, len(spec.joints)).double().numpy()
+    together = tip.of_many(q)
+    for rows in (1, 3, 7):
+        alone = [tip.of_many(q[first : first + rows]) for first in range(0, len(q), rows)]
+        np.testing.assert_array_equal(np.concatenate(alone, axis=1), together)
+
+
 def test_the_tip_s_place_without_torch_is_that_of_the_module(spec):
     assert_same_in_numbers_and_arrays(spec)
 

@@ -16,7 +16,8 @@ from tests.training.small import SMALL, command, metrics
 
 SIZES = (*SMALL, "collector.num_envs=64", "collector.frames_per_batch=1024", "env.task.max_steps=40")
 needs_ray = pytest.mark.skipif(find_spec("ray") is None, reason="needs ray")
-COLLECTORS = ("multi_sync", "multi_async", pytest.param("ray", marks=needs_ray))
+COLLECTORS = ("async", "multi_sync", "multi_async", pytest.param("ray", marks=needs_ray))
+WORKERS = {"single": 0, "async": 1}  # others have two
 pytestmark = [
     pytest.mark.slow,
     pytest.mark.timeout(900),  # two or three whole runs each
@@ -54,7 +55,7 @@ def start(collector, folder, *overrides):
         time.sleep(0.005)
     everybody = descendants(process.pid)
     workers = {one for one in everybody if collector != "ray" or "WorkerCollector" in command_of(one)}
-    assert len(workers) == 2
+    assert len(workers) == WORKERS.get(collector, 2)
     return process, workers, everybody
 
 
@@ -69,7 +70,7 @@ def assert_goes_on(folder, finished):
     assert ours["weights_sha256"] == theirs["weights_sha256"]
 
 
-@pytest.mark.parametrize("collector", COLLECTORS)
+@pytest.mark.parametrize("collector", ["single", *COLLECTORS[1:]])  # async: tests/training/test_loop.py
 def test_a_killed_run_leaves_no_process_and_goes_on(finished, tmp_path, collector):
     process, _, everybody = start(collector, tmp_path)
     process.kill()
@@ -95,6 +96,7 @@ def test_a_killed_worker_ends_the_run_in_one_line_and_it_goes_on(finished, tmp_p
 @pytest.mark.parametrize(
     ("collector", "number", "code"),
     [
+        ("async", signal.SIGINT, 130),
         ("multi_sync", signal.SIGINT, 130),
         ("multi_async", signal.SIGINT, 130),
         pytest.param("ray", signal.SIGTERM, 143, marks=needs_ray),
@@ -108,3 +110,19 @@ def test_a_signal_that_reaches_all_processes_saves_and_the_run_goes_on(finished,
     assert "python -m physai.train resume=run" in output
     assert all_gone(everybody)
     assert_goes_on(tmp_path, finished(collector))
+
+
+@pytest.mark.parametrize(
+    ("late", "number", "code"), [(0.0, signal.SIGINT, 130), (0.1, signal.SIGTERM, 143), (0.4, signal.SIGINT, 130)]
+)
+def test_a_signal_while_the_processes_start_ends_them_all(tmp_path, late, number, code):
+    process = command("train", *SIZES, "hydra.run.dir=run", cwd=tmp_path, start_new_session=True)
+    deadline = time.monotonic() + 60
+    while not (everybody := descendants(process.pid)) and time.monotonic() < deadline:
+        time.sleep(0.001)
+    time.sleep(late)
+    os.killpg(process.pid, number)
+    output = process.communicate(timeout=60)[0]
+    assert process.returncode == code, output
+    assert "Traceback" not in output
+    assert all_gone(everybody)
