@@ -1,5 +1,6 @@
 """What tests share: one thread, and the environments that physai comes with."""
 
+import signal
 from collections.abc import Callable
 from pathlib import Path
 
@@ -14,6 +15,9 @@ from physai.config import compose, conf_dir, validate
 from physai.envs.simulation import EnvConfig
 from physai.training.config import TrainConfig
 from physai.training.run import run_training
+
+# A shell that starts the tests in the background has them, and whatever they start, take no notice of Ctrl-C.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # A busy machine is no fault of a test: how long an example takes says nothing.
 settings.register_profile("physai", deadline=None, suppress_health_check=[HealthCheck.too_slow])

@@ -132,7 +132,7 @@ def test_a_session_is_recorded_as_it_was(start, peer, policy_path, tmp_path):
     bag = tmp_path / "bag"
     assert [(m.point.x, m.point.y) for _, m in read(bag, "/inference_node/goal", PointStamped)] == goals
     states = [m.data for _, m in read(bag, "/inference_node/state", String)]
-    assert states.count("active") == len(goals)
+    assert states.count("active") >= len(goals)  # more, where a busy machine made it hold in between
     assert same_end(states, [state for _, state in peer.states])
     assert [m.data for _, m in read(bag, "/emergency_stop", Bool)] == [True]
     pressed = [m.data for _, m in read(bag, "/inference_node/estopped", Bool)]
