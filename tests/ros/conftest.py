@@ -1,12 +1,14 @@
 """Real ROS 2 for tests: loopback only, a domain for each test, and nothing left behind."""
 
 import os
+import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import pytest
+from _pytest.runner import runtestprotocol
 
 os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"  # before anything of ROS starts
 
@@ -17,6 +19,47 @@ prepare_middleware()
 from tests.ros.forge import close_forges
 from tests.ros.loop import Loop, closed_loop
 from tests.ros.peer import SHM, Peer, Process, free_domain, node_command, remove_dead_segments
+from tests.ros.stalls import Stalls
+
+ATTEMPTS = 3
+STALLS = pytest.StashKey[Stalls]()
+REPEATED = pytest.StashKey[list[str]]()
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    config.stash[REPEATED] = []
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_protocol(item: pytest.Item, nextitem: pytest.Item | None) -> bool | None:
+    """Repeat a test that failed while the machine stood still: how soon a node answers says nothing of it then."""
+    if not item.path.is_relative_to(Path(__file__).parent):
+        return None
+    if STALLS not in item.config.stash:
+        item.config.stash[STALLS] = Stalls()
+        item.config.add_cleanup(item.config.stash[STALLS].close)
+    for attempt in range(1, ATTEMPTS + 1):
+        began = time.monotonic()
+        item.ihook.pytest_runtest_logstart(nodeid=item.nodeid, location=item.location)
+        reports = runtestprotocol(item, nextitem=nextitem, log=False)
+        failed = any(report.failed for report in reports)
+        stall = item.config.stash[STALLS].longest(since=began) if failed and attempt < ATTEMPTS else 0.0
+        if stall == 0.0:
+            break
+        reason = next(str(report.longrepr).splitlines()[-1] for report in reports if report.failed)
+        item.config.stash[REPEATED].append(f"{item.nodeid}: {reason}, and a stall of {stall:.2f} s")
+        item._initrequest()  # fixtures of its own
+    for report in reports:
+        item.ihook.pytest_runtest_logreport(report=report)
+    item.ihook.pytest_runtest_logfinish(nodeid=item.nodeid, location=item.location)
+    return True
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:
+    if config.stash[REPEATED]:
+        terminalreporter.section("repeated: the machine stood still")
+        for line in config.stash[REPEATED]:
+            terminalreporter.line(line)
 
 
 @pytest.fixture(scope="session", autouse=True)
