@@ -3,7 +3,8 @@
 Importing it takes torch and numpy, and nothing else.
 """
 
-from physai.deploy.controller import Command, Controller, State
+from physai.deploy.command import Command, State
+from physai.deploy.controller import Controller
 from physai.deploy.goals import Goal
 from physai.deploy.joints import JointState
 from physai.deploy.metadata import Metadata, PolicyError

@@ -1,54 +1,24 @@
 """The controller: from joint states and goals to safe velocity commands. No ROS; time is an argument."""
 
-import enum
 import math
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from physai.deploy.command import Command, State
+from physai.deploy.following import Following, Progress, Strain
 from physai.deploy.goals import Goal, GoalError, accept
-from physai.deploy.joints import JointReader, JointState, JointStateError, to_float
-from physai.deploy.limits import VelocityLimits
-from physai.deploy.metadata import Metadata
+from physai.deploy.joints import Heard, JointReader, JointState, JointStateError
+from physai.deploy.limits import LATE, VelocityLimits, check
 from physai.deploy.parameters import ControllerConfig
 from physai.deploy.policy import Policy
-from physai.errors import UserError
 
-_LATE = 3.0  # periods
 _STILL = 3  # updates in a row at the same time
 _STEP = 0.75  # periods; what is asked again sooner is the same step of a policy that remembers
 _MOVED = 0.1  # tolerances; a goal that moves by less is still the same
-
-
-class State(enum.Enum):
-    """What the controller does, and how it ends."""
-
-    WAITING = "waiting"  # for a joint state, a goal, or permission to move
-    ACTIVE = "active"  # the policy drives
-    REACHED = "reached"  # zero velocity at the goal, until it moves or the arm drifts
-    HOLD = "hold"  # zero velocity, until enough good joint states have come in a row
-    FAULT = "fault"  # zero velocity, until reset
-    ESTOP = "estop"  # zero velocity, until reset
-
-
-@dataclass(frozen=True, eq=False)
-class Command:
-    """What to send to the arm.
-
-    Attributes:
-        velocity: rad/s, in the order of the policy's joints; None: send nothing, the arm has not been heard of yet.
-        state: The controller's state.
-        reasons: Why the arm stands or is held back, and what was refused; empty when the policy drives, within the
-            limits of velocity and acceleration that always hold.
-    """
-
-    velocity: np.ndarray | None
-    state: State
-    reasons: tuple[str, ...]
 
 
 class Controller:
@@ -79,14 +49,17 @@ class Controller:
         self._period = 1.0 / policy.metadata.control_rate
         self._stopwatch = stopwatch
         self._zeros = self._last = np.zeros(len(policy.metadata.joints))
+        self._counters: Counter[str] = Counter()
+        self._latched: State | None = None
+        self._latch_reason = ""
         config = config or ControllerConfig()
-        self._reader = JointReader(policy.metadata, config)
+        self._robot = JointReader(policy.metadata, config)
+        self._progress = Progress(policy.metadata.goal_tolerance)
+        self._strain = Strain(policy.metadata)
         self.configure(config)
         self._now: float | None = None
         self._still = 0  # updates in a row at that time
-        self._position: np.ndarray | None = None
-        self._velocity = self._zeros
-        self._received = -math.inf
+        self._received = -math.inf  # when the robot was heard of: its joint that was not for longest
         self._goal: np.ndarray | None = None
         self._reached = False
         self._nothing = np.zeros(policy.metadata.memory_size, np.float32)
@@ -94,12 +67,10 @@ class Controller:
         self._step = 0.0  # s since the memory's last one
         self._needed = 0  # good joint states until a hold ends
         self._hold_reason = ""
+        self._gave_up = ""  # why this goal is not pursued any more
         self._failures = 0  # of the policy, in a row
-        self._latched: State | None = None
-        self._latch_reason = ""
         self._command = Command(None, State.WAITING, ())
         self._since = 0.0
-        self._counters: Counter[str] = Counter()
 
     def configure(self, config: ControllerConfig) -> None:
         """Take other limits and timeouts; they hold from the next update on.
@@ -107,17 +78,19 @@ class Controller:
         Raises:
             UserError: If the limits do not fit the robot; those of before stay.
         """
-        _check(config, self.policy.metadata, self._period)
+        check(config, self.policy.metadata)
         self.config = config
-        self._reader.configure(config)
+        self._robot.configure(config)
         self._limits = VelocityLimits(self.policy.metadata, config)
+        self._following = Following(self.policy.metadata, config)
         # A lower velocity holds at once, whatever the acceleration limit: the margin may be too narrow for another.
         self._last = self._last * min(1.0, config.max_velocity / max(np.abs(self._last).max(), 1e-9))
+        self._check_position()
 
     def update(
         self,
         now: float,
-        joint_state: JointState | None = None,
+        joint_state: JointState | list[JointState] | None = None,
         goal: Goal | None = None,
         interlocks: Sequence[str] = (),
     ) -> Command:
@@ -125,7 +98,8 @@ class Controller:
 
         Args:
             now: The time, s, by a clock that does not jump.
-            joint_state: A joint state that has come in since the last update.
+            joint_state: A joint state that has come in since the last update; a list of them, where the robot tells
+                of its joints in several messages.
             goal: A goal that has come in since then; the last good one stays until another comes.
             interlocks: Why the arm must not move now though nothing is wrong with it, such as "not enabled"; it waits
                 until there is none.
@@ -138,16 +112,23 @@ class Controller:
         elapsed, stop = self._take_time(now, reasons)
         if goal is not None:
             self._take_goal(goal, reasons)
+        if self._command.state is State.ACTIVE and not stop:
+            self._following.commanded(now, self._last)
+        else:
+            self._following.restart()
         if joint_state is not None and math.isfinite(now):
-            self._take_state(now, joint_state, not stop, reasons)
-        if self._position is not None and now - self._received > self.config.state_timeout:
-            reasons.append(self._hold("state old", f"the last joint state is {now - self._received:.3f} s old"))
+            for one in joint_state if isinstance(joint_state, list) else (joint_state,):
+                self._take_state(now, one, not stop, reasons)
+        if self._received > -math.inf and now - self._received > self.config.state_timeout:
+            oldest = self._robot.oldest()
+            what = "joint state" if oldest is None else f"state of '{oldest}'"
+            reasons.append(self._hold("state old", f"the last {what} is {now - self._received:.3f} s old"))
         state = self._state(interlocks, reasons)
         velocity, memory = self._zeros, self._nothing
         if state is State.ACTIVE:
             if not stop:
                 velocity, memory = self._drive(elapsed, reasons)
-            state = State.REACHED if self._reached else State.ACTIVE
+            state = State.HOLD if self._gave_up else State.REACHED if self._reached else State.ACTIVE
         if self._latched not in (None, state):  # an emergency stop while the policy was asked, or a policy that failed
             velocity, memory, state = self._zeros, self._nothing, self._latched
             reasons.append(self._latch_reason)
@@ -155,7 +136,7 @@ class Controller:
             self._since = self._now or 0.0
             self._counters[f"entered {state.value}"] += 1
         self._last, self._memory = velocity, memory
-        unheard = state is State.WAITING and self._position is None
+        unheard = state is State.WAITING and self._received == -math.inf
         self._command = Command(None if unheard else velocity.copy(), state, tuple(reasons))
         return self._command
 
@@ -165,24 +146,26 @@ class Controller:
         self._latched, self._latch_reason = State.ESTOP, "emergency stop"
 
     def reset(self) -> None:
-        """Leave a fault or an emergency stop for a hold, which ends when the robot is seen to be well.
+        """Leave a fault, an emergency stop or a goal given up for a hold, which ends when the robot is seen to be well.
 
         The goal is forgotten: a reset permits motion, a new goal starts it.
         """
-        if self._latched is not None:
+        if self._latched is not None or self._gave_up:
             self._latched = None
+            self._strain.restart()
             self.forget_goal()
             self._failures = 0
             self._needed = self.config.recovery_states
 
     def forget_goal(self) -> None:
         """Wait for a new goal."""
-        self._goal, self._reached = None, False
+        self._goal, self._reached, self._gave_up = None, False, ""
+        self._progress.restart()
 
     def snapshot(self) -> dict[str, Any]:
         """State, its reasons and counters, for diagnostics; plain values only."""
         at = self._now if self._now is not None else 0.0
-        known = self._position is not None
+        known = self._received > -math.inf
         return {
             "state": self._command.state.value,
             "state_since": self._since,
@@ -211,7 +194,7 @@ class Controller:
         if elapsed < 0 or elapsed > self.config.clock_jump:
             reasons.append(self._hold("clock", f"the clock jumped by {elapsed:.3f} s"))
             return 0.0, True
-        if elapsed > _LATE * self._period:
+        if elapsed > LATE * self._period:
             self._counters["late updates"] += 1
             reasons.append(f"update came after {elapsed:.3f} s, {elapsed / self._period:.1f} periods")
             return self._period, True
@@ -230,16 +213,18 @@ class Controller:
             reasons.append(f"goal out of reach: {new.tolist()} is the nearest in reach")
         tolerance = self.policy.metadata.goal_tolerance
         if self._goal is None or np.abs(new - self._goal).max() > _MOVED * tolerance:
-            self._reached = False
+            self._reached, self._gave_up = False, ""
+            self._progress.restart()
             self._memory = self._nothing
         self._goal = new
 
     def _take_state(self, now: float, joint_state: JointState, timely: bool, reasons: list[str]) -> None:
         try:
-            received = now if joint_state.received is None else min(to_float(joint_state.received), now)
-            position, velocity = self._reader.read(joint_state, received)
-            if not now - received <= self.config.state_timeout:  # also where it is NaN
-                raise JointStateError("old on arrival", f"it is {now - received:.3f} s old", implausible=True)
+            heard = self._robot.read(joint_state, now)
+            if heard is None:
+                self._counters["states of other joints"] += 1
+                return
+            self._take_motion(heard, reasons)
         except (JointStateError, AttributeError) as error:
             rejected = error if isinstance(error, JointStateError) else JointStateError("malformed", "it is none")
             self._counters[f"states rejected: {rejected.kind}"] += 1
@@ -250,13 +235,40 @@ class Controller:
                 self._needed = self.config.recovery_states
             return
         self._counters["states"] += 1
-        self._position, self._velocity, self._received = position, velocity, received
-        if timely:
+        if timely and heard.complete:
             self._needed = max(0, self._needed - 1)
-        far = self._limits.far_beyond(position)
-        if far is not None and self._latched is not State.FAULT:
-            joint = self.policy.metadata.joints[far]
-            self._fault("position", f"'{joint}' is far beyond its position limit, at {position[far]:.3f} rad")
+
+    def _take_motion(self, heard: Heard, reasons: list[str]) -> None:
+        """See whether the arm may be driven on after what was heard of it."""
+        robot = self._robot
+        before, self._received = self._received, robot.received
+        silent = self._received - before if before > -math.inf else 0.0
+        if silent > self.config.resume_timeout or heard.another is not None:
+            kind = "silent" if heard.another is None else "another source"
+            what = f"the robot was silent for {silent:.1f} s"
+            self._hold(
+                kind, what if heard.another is None else f"'{heard.another}' is told by another source than before"
+            )
+            if self._goal is not None:
+                self._counters[f"goals forgotten: {kind}"] += 1
+                reasons.append(f"goal forgotten: {self._hold_reason}")
+                self.forget_goal()
+        self._check_position()
+        if self._received == -math.inf:
+            return
+        if robot.feels and (beyond := self._strain.heard(self._received, robot.effort, self.config.effort_time)):
+            self._fault("effort", beyond)
+        deviation = self._following.heard(self._received, robot.motion)
+        if deviation is not None:
+            if not deviation.consistent:
+                raise JointStateError("velocity inconsistent", deviation.text, implausible=True)
+            self._fault("following", deviation.text)
+
+    def _check_position(self) -> None:
+        far = self._limits.far_beyond(self._robot.position)
+        if far is not None:
+            joint, position = self.policy.metadata.joints[far], self._robot.position[far]
+            self._fault("position", f"'{joint}' is far beyond its position limit, at {position:.3f} rad")
 
     def _hold(self, kind: str, reason: str) -> str:
         if not self._needed:
@@ -266,7 +278,7 @@ class Controller:
         return reason
 
     def _fault(self, kind: str, reason: str) -> None:
-        if self._latched is State.ESTOP:
+        if self._latched is not None:
             return
         self._counters[f"faults: {kind}"] += 1
         self._latched, self._latch_reason = State.FAULT, reason
@@ -275,11 +287,15 @@ class Controller:
         if self._latched is not None:
             reasons.append(self._latch_reason)
             return self._latched
-        if self._position is None:
-            reasons += ["no joint state yet", *interlocks]
+        if self._received == -math.inf:
+            missing = self._robot.oldest()
+            reasons += ["no joint state yet" if missing is None else f"no state of '{missing}' yet", *interlocks]
             return State.WAITING
         if self._needed:
             reasons.append(f"{self._needed} more good joint states are needed")
+            return State.HOLD
+        if self._gave_up:
+            reasons.append(self._gave_up)
             return State.HOLD
         reasons += interlocks
         if self._goal is None:
@@ -288,18 +304,22 @@ class Controller:
 
     def _drive(self, elapsed: float, reasons: list[str]) -> tuple[np.ndarray, np.ndarray]:
         """Ask the policy, and limit what it wants; return the velocity, and what the policy remembers."""
-        assert self._position is not None
         assert self._goal is not None
+        robot, metadata = self._robot, self.policy.metadata
         started = self._stopwatch()
         try:
-            tolerance = self.policy.metadata.goal_tolerance
-            distance = self.policy.distance(self._position, self._goal)
+            distance = self.policy.distance(robot.turned, self._goal)
             if not 0 <= distance < math.inf:
                 return self._policy_failed("distance", f"gave the distance {distance}", reasons)
-            self._reached = distance < tolerance * (self.config.reached_hysteresis if self._reached else 1.0)
+            self._reached = distance < metadata.goal_tolerance * (
+                self.config.reached_hysteresis if self._reached else 1
+            )
             if self._reached:
+                self._progress.restart()
                 return self._zeros, self._nothing
-            wanted, memory = self._ask(self._position, self._velocity, self._goal)
+            if self._progress.waited(distance, elapsed) > self.config.progress_timeout:
+                return self._give_up(distance, reasons)
+            wanted, memory = self._ask(robot.turned, robot.velocity, self._goal)
         except Exception as error:  # a policy is a foreign program
             return self._policy_failed("exception", f"raised {type(error).__name__}: {_last_line(error)}", reasons)
         took = self._stopwatch() - started
@@ -317,11 +337,19 @@ class Controller:
         if self._limits.out_of_range(wanted):
             self._counters["commands clamped"] += 1
             reasons.append("the policy's command was beyond its range")
-        velocity, held_back = self._limits.apply(wanted, self._position, self._last, elapsed)
+        velocity, held_back = self._limits.apply(wanted, robot.position, self._last, elapsed)
         if held_back is not None:
             self._counters["ticks at a position limit"] += 1
             reasons.append(held_back)
         return velocity, self._remember(memory, elapsed)
+
+    def _give_up(self, distance: float, reasons: list[str]) -> tuple[np.ndarray, np.ndarray]:
+        self._counters["holds: no progress"] += 1
+        self._gave_up = self._hold_reason = (
+            f"no progress for {self.config.progress_timeout:g} s, {distance:.3f} m from the goal: waiting for another"
+        )
+        reasons.append(self._gave_up)
+        return self._zeros, self._nothing
 
     def _remember(self, memory: np.ndarray, elapsed: float) -> np.ndarray:
         """Return the new memory, or the old one: who asks more often than in training must not make time run faster."""
@@ -346,37 +374,6 @@ class Controller:
         return self._zeros, self._nothing
 
 
-def smallest_margin(max_velocity: float, state_timeout: float, period: float) -> float:
-    """What the arm may travel until an old joint state stops it, and an update that is just not late sees that.
-
-    Args:
-        max_velocity: rad/s.
-        state_timeout: s.
-        period: Between updates, s.
-
-    Returns:
-        rad, rounded up to a thousandth.
-    """
-    return math.ceil(max_velocity * (state_timeout + _LATE * period) * 1e3 - 1e-6) / 1e3
-
-
 def _last_line(error: Exception) -> str:
     """What went wrong; TorchScript's errors begin with a traceback."""
     return (str(error).strip().splitlines() or ["no reason given"])[-1][:80]
-
-
-def _check(config: ControllerConfig, metadata: Metadata, period: float) -> None:
-    slowest = metadata.velocity_limit.min()
-    if config.max_velocity > slowest:
-        raise UserError(f"max_velocity: {config.max_velocity} rad/s is beyond the robot's limit, {slowest:g} rad/s")
-    if config.clock_jump <= _LATE * period:
-        raise UserError(f"clock_jump: must be longer than {_LATE:g} control periods, got {config.clock_jump}")
-    span = (metadata.position_limit[:, 1] - metadata.position_limit[:, 0]).min()
-    if 2 * config.limit_margin >= span:
-        raise UserError(f"limit_margin: {config.limit_margin} rad leaves no room between the position limits")
-    blind = smallest_margin(config.max_velocity, config.state_timeout, period)
-    if np.isfinite(metadata.position_limit).any() and blind > config.limit_margin + 1e-9:
-        raise UserError(
-            f"limit_margin: at {config.max_velocity} rad/s and a state_timeout of {config.state_timeout} s it must be "
-            f"{blind:.3f} rad at least, got {config.limit_margin}"
-        )

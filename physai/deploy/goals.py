@@ -45,6 +45,8 @@ def accept(goal: Goal, metadata: Metadata, project: bool) -> np.ndarray:
     radius = math.hypot(*position)
     if not math.isfinite(radius):
         raise GoalError("not finite", "goal rejected: it is not finite")
+    if not isinstance(goal.frame, str):
+        raise GoalError("malformed", "goal rejected: its frame is no name")
     if goal.frame != metadata.goal_frame:
         raise GoalError("wrong frame", f"goal rejected: frame '{goal.frame}' is not '{metadata.goal_frame}'")
     inner, outer = metadata.goal_radius

@@ -1,9 +1,14 @@
 """From what a policy wants to what an arm may do: the limits, in the order in which they hold."""
 
+import math
+
 import numpy as np
 
 from physai.deploy.metadata import Metadata
 from physai.deploy.parameters import ControllerConfig
+from physai.errors import UserError
+
+LATE = 3.0  # control periods; an update that comes later stands still
 
 
 class VelocityLimits:
@@ -44,7 +49,7 @@ class VelocityLimits:
             last: What was commanded last, rad/s.
             elapsed: Time since then, s.
         """
-        velocity = np.clip(wanted, -self._command, self._command)
+        velocity = np.minimum(np.maximum(wanted, -self._command), self._command)  # twice as fast as np.clip
         beyond = ((position < self._lower) | (position > self._upper)).any()
         reason = "a joint is beyond its position limit: slow" if beyond else None
         fastest, largest = (self._limit_velocity if beyond else self._max_velocity), np.abs(velocity).max()
@@ -53,11 +58,51 @@ class VelocityLimits:
         # Outward motion at a limit stops at once, what is wanted as what still goes on.
         highest = np.where(position >= self._inner_upper, 0.0, np.inf)
         lowest = np.where(position <= self._inner_lower, 0.0, -np.inf)
-        inward = np.clip(velocity, lowest, highest)
-        going, last = last, np.clip(last, lowest, highest)
+        inward = np.minimum(np.maximum(velocity, lowest), highest)
+        going, last = last, np.minimum(np.maximum(last, lowest), highest)
         if reason is None and ((inward != velocity) | (going != last)).any():
             reason = "a joint is at its position limit: no motion outward"
         change = inward - last
         allowed, largest = self._max_acceleration * elapsed, np.abs(change).max()
         velocity = inward if largest <= allowed else last + change * (allowed / largest)
-        return np.where(going == last, velocity, 0.0), reason
+        velocity = np.where(going == last, velocity, 0.0)
+        if beyond and (largest := np.abs(velocity).max()) > fastest:  # slow at once, however fast it was
+            velocity = velocity * (fastest / largest)
+        return velocity, reason
+
+
+def smallest_margin(max_velocity: float, state_timeout: float, period: float) -> float:
+    """What the arm may travel until an old joint state stops it, and an update that is just not late sees that.
+
+    Args:
+        max_velocity: rad/s.
+        state_timeout: s.
+        period: Between updates, s.
+
+    Returns:
+        rad, rounded up to a thousandth.
+    """
+    return math.ceil(max_velocity * (state_timeout + LATE * period) * 1e3 - 1e-6) / 1e3
+
+
+def check(config: ControllerConfig, metadata: Metadata) -> None:
+    """See that limits and timeouts fit a robot.
+
+    Raises:
+        UserError: If they do not, and which.
+    """
+    period = 1.0 / metadata.control_rate
+    slowest = metadata.velocity_limit.min()
+    if config.max_velocity > slowest:
+        raise UserError(f"max_velocity: {config.max_velocity} rad/s is beyond the robot's limit, {slowest:g} rad/s")
+    if config.clock_jump <= LATE * period:
+        raise UserError(f"clock_jump: must be longer than {LATE:g} control periods, got {config.clock_jump}")
+    span = (metadata.position_limit[:, 1] - metadata.position_limit[:, 0]).min()
+    if 2 * config.limit_margin >= span:
+        raise UserError(f"limit_margin: {config.limit_margin} rad leaves no room between the position limits")
+    blind = smallest_margin(config.max_velocity, config.state_timeout, period)
+    if np.isfinite(metadata.position_limit).any() and blind > config.limit_margin + 1e-9:
+        raise UserError(
+            f"limit_margin: at {config.max_velocity} rad/s and a state_timeout of {config.state_timeout} s it must be "
+            f"{blind:.3f} rad at least, got {config.limit_margin}"
+        )

@@ -88,6 +88,9 @@ class ControllerConfig(Parameters):
     limit_velocity: float = parameter(0.05, "fastest joint while one is beyond its limit", "rad/s", 1e-3, 100.0)
     limit_fault: float = parameter(0.2, "farther than this beyond a position limit is a fault", "rad", 0.0, 10.0)
     state_timeout: float = parameter(0.1, "a joint state older than this stops the arm", "s", 1e-3, 10.0)
+    resume_timeout: float = parameter(
+        1.0, "a robot silent for longer is not driven on to its old goal", "s", 1e-3, 3600.0
+    )
     recovery_states: int = parameter(5, "good joint states in a row that end a hold", "", 1, 1000)
     jump_factor: float = parameter(3.0, "a joint this many times faster than its limit is a sensor error", "", 1.0, 1e3)
     allow_velocity_estimate: bool = parameter(False, "estimate missing velocities from positions")
@@ -97,4 +100,17 @@ class ControllerConfig(Parameters):
     reached_hysteresis: float = parameter(1.5, "a reached goal is left at this many tolerances", "", 1.0, 100.0)
     policy_timeout: float = parameter(0.01, "a policy slower than this has failed", "s", 1e-5, 1.0)
     policy_failures: int = parameter(3, "failures of the policy in a row that are a fault", "", 1, 1000)
+    following_error: float = parameter(
+        0.3, "share of the commanded motion that may be missing, or too much, before it is a fault", "", 0.05, 100.0
+    )
+    following_window: float = parameter(
+        0.3, "time over which commanded and measured motion are compared", "s", 0.1, 10.0
+    )
+    velocity_error: float = parameter(
+        0.25, "reported velocities that differ by more from the moved positions are sensor errors", "rad/s", 0.01, 100.0
+    )
+    progress_timeout: float = parameter(
+        10.0, "a distance that has not fallen for this long ends the motion", "s", 0.1, 3600.0
+    )
+    effort_time: float = parameter(0.5, "an effort beyond its limit for this long is a fault", "s", 0.0, 60.0)
     clock_jump: float = parameter(1.0, "an update later than this is a jump of the clock", "s", 0.01, 3600.0)

@@ -125,6 +125,8 @@ def load_policy(path: str | Path, sha256: str | None = None, expect_joints: Sequ
         PolicyError: If the file is missing, damaged, altered, of another format, or for other joints; it says which.
     """
     path = Path(path)
+    if not isinstance(sha256, str | None):
+        raise PolicyError(f"{path}: sha256 must be text, in hexadecimal, not {sha256!r:.80}")
     content = archive.read(path)
     digest = hashlib.sha256(content).hexdigest()
     expected, source = (sha256, "the expected one") if sha256 is not None else _beside(path)

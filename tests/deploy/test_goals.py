@@ -53,9 +53,14 @@ def test_a_goal_that_is_not_two_numbers_is_rejected(metadata, position):
     assert rejection(Goal(position, "base"), metadata, True) == "malformed"
 
 
-@pytest.mark.parametrize("frame", ["world", "", "/base", "Base", None])
+@pytest.mark.parametrize("frame", ["world", "", "/base", "Base"])
 def test_a_goal_in_another_frame_is_rejected(metadata, frame):
     assert rejection(Goal([0.4, 0.0], frame), metadata, True) == "wrong frame"
+
+
+@pytest.mark.parametrize("frame", [None, 7, np.array(["base", "base"]), np.array([]), ["base"]])
+def test_a_goal_whose_frame_is_no_name_is_rejected(metadata, frame):
+    assert rejection(Goal([0.4, 0.0], frame), metadata, True) == "malformed"
 
 
 @pytest.mark.parametrize("position", [[0.0, 0.0], [0.2, 0.2], [0.531, 0.0], [5.0, -5.0], [1e308, 0.0]])

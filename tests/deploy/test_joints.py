@@ -7,7 +7,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from physai.deploy import ControllerConfig, JointState
-from physai.deploy.joints import JointReader, JointStateError
+from physai.deploy.joints import Heard, JointReader, JointStateError
 
 NAMES = ("joint1", "joint2")
 
@@ -37,6 +37,11 @@ def read(reader, *arguments, received=None, **values):
     return reader.read(joint_state, joint_state.stamp if received is None else received)
 
 
+def estimated(reader, *arguments, **values):
+    read(reader, *arguments, **values)
+    return reader.velocity
+
+
 def rejection(reader, *arguments, implausible=False, **values):
     with pytest.raises(JointStateError) as caught:
         read(reader, *arguments, **values)
@@ -46,7 +51,8 @@ def rejection(reader, *arguments, implausible=False, **values):
 
 
 def assert_reads(reader, joint_state, position, velocity):
-    for found, expected in zip(reader.read(joint_state, joint_state.stamp), (position, velocity), strict=True):
+    assert reader.read(joint_state, joint_state.stamp) == Heard(complete=True, another=None)
+    for found, expected in ((reader.position, position), (reader.velocity, velocity)):
         assert found.dtype == np.float64
         np.testing.assert_allclose(found, expected, rtol=1e-9)
 
@@ -88,9 +94,6 @@ NO_NUMBERS = (None, ("a", "b"), ("0.1", "0.2"), (None, 0.2), ((0.1,), 0.2), (10*
 @pytest.mark.parametrize(
     ("kind", "bad"),
     {
-        "joint missing": {"names": ("joint1", "joint3")},
-        "joint missing ": {"names": ("joint1",), "position": (0.1,), "velocity": ()},
-        "joint missing  ": {"names": (), "position": (), "velocity": ()},
         "duplicate name": {"names": ("joint1", "joint1")},
         "duplicate name ": {"names": (*NAMES, "joint2"), "position": (0.1, 0.2, 0.3), "velocity": ()},
         "lengths disagree": {"position": (0.1,)},
@@ -116,8 +119,76 @@ def test_a_malformed_state_is_rejected_and_forgotten(reader, kind, bad):
     assert_reads(reader, state(stamp=0.01), [0.1, 0.2], [0.3, 0.4])  # not repeated: the stamp was not taken over
 
 
-def test_a_first_state_without_any_joint_is_rejected(reader):
-    assert rejection(reader, (), (), 0.0, ()) == "joint missing"
+@pytest.mark.parametrize(
+    "other",
+    [
+        {"names": ("finger1", "finger2")},
+        {"names": (), "position": (), "velocity": ()},
+        {"names": ("finger", "finger"), "position": (math.nan,), "velocity": ("fast",), "stamp": None},
+    ],
+)
+def test_a_state_that_names_none_of_the_joints_is_not_ours_whatever_else_it_says(reader, other):
+    read(reader)
+    assert read(reader, received=0.01, **other) is None
+    assert_reads(reader, state((0.11, 0.2), stamp=0.02), [0.11, 0.2], [0.3, 0.4])
+
+
+def test_states_of_some_joints_are_merged_joint_by_joint(reader):
+    first = state((0.1, 7.0), (0.3, 7.0), 0.0, ("joint1", "finger"))
+    assert reader.read(first, 5.00) == Heard(complete=False, another=None)
+    assert reader.received == -math.inf
+    assert reader.oldest() == "joint2"
+    assert reader.read(state((0.2,), (0.4,), 900.0, ("joint2",)), 5.01) == Heard(complete=True, another=None)
+    np.testing.assert_array_equal([reader.position, reader.velocity], [[0.1, 0.2], [0.3, 0.4]])
+    assert reader.received == 5.00  # as old as its oldest joint
+    assert not reader.read(state((0.21,), (0.4,), 900.02, ("joint2",)), 5.03).complete
+    assert not reader.read(state((0.22,), (0.4,), 900.04, ("joint2",)), 5.05).complete
+    assert (reader.received, reader.oldest()) == (5.00, "joint1")
+    assert reader.read(state((0.13,), (0.3,), 0.06, ("joint1",)), 5.06).complete
+    np.testing.assert_allclose([reader.position, reader.velocity], [[0.13, 0.22], [0.3, 0.4]])
+    assert (reader.received, reader.oldest()) == (5.05, "joint2")
+
+
+def test_each_joint_is_judged_by_its_own_state_before(reader):
+    for stamp in np.arange(50) * 0.02:
+        read(reader, (0.1,), (0.0,), float(stamp), ("joint1",))
+    read(reader, (0.2,), (0.0,), 0.0, ("joint2",))  # joint2's clock is another one
+    with pytest.raises(JointStateError, match=r"'joint2' jumped by 0\.300 rad in 0\.020 s"):
+        read(reader, (0.1, 0.5), (0.0, 0.0), stamp=1.0 - 0.98, received=1.0, names=("finger", "joint2"))
+    with pytest.raises(JointStateError, match="its stamp is that of the state before"):
+        read(reader, (0.1,), (0.0,), 0.98, ("joint1",))
+
+
+def test_a_joint_that_another_source_tells_is_named(reader):
+    def told(names, source, stamp):
+        values = (0.1,) * len(names)
+        return reader.read(JointState(names, values, values, stamp, source=source), stamp)
+
+    assert told(("joint1",), "a", 0.02).another is None
+    assert told(("joint2",), "b", 0.02).another is None
+    assert told(("joint2",), "b", 0.04).another is None
+    assert told(NAMES, "a", 0.06).another == "joint2"
+    assert told(NAMES, None, 0.08).another is None  # nobody knows
+    assert told(NAMES, "a", 0.10).another is None
+
+
+def test_efforts_are_read_where_they_are_told(reader):
+    assert not reader.feels
+    reader.read(JointState(NAMES, (0.1, 0.2), (0.0, 0.0), 0.0, effort=(1.0, math.nan)), 0.0)
+    np.testing.assert_array_equal(reader.effort, [1.0, math.nan])
+    assert reader.feels
+    read(reader, stamp=0.02)
+    assert np.isnan(reader.effort).all()
+    with pytest.raises(JointStateError, match="2 names, but effort has the shape"):
+        reader.read(JointState(NAMES, (0.1, 0.2), (0.0, 0.0), 0.04, effort=(1.0,)), 0.04)
+
+
+@pytest.mark.parametrize("turns", [-(10**6), -1, 0, 1, 10**6])
+def test_a_joint_without_limits_is_turned_back_in_double_precision(reader, turns):
+    read(reader, (0.5 + turns * 2 * math.pi, 2.5), (0.0, 0.0))
+    np.testing.assert_allclose(reader.turned, [0.5, 2.5], atol=2e-9)
+    if not turns:
+        assert reader.turned.tolist() == [0.5, 2.5]
 
 
 @pytest.mark.parametrize("velocity", [(), (math.nan, 0.4), (0.3, math.nan), (math.inf, 0.4), (math.nan, math.nan)])
@@ -196,7 +267,7 @@ def test_a_continuous_joint_has_moved_the_shorter_way_around(metadata, start, tu
     if abs(moved) > 7.5 * elapsed + 0.01:
         assert rejection(joint_reader, there, stamp=elapsed, implausible=True) == "position jump"
     else:
-        _, velocity = read(joint_reader, there, (), elapsed)
+        velocity = estimated(joint_reader, there, (), elapsed)
         np.testing.assert_allclose(velocity, [np.clip(moved / elapsed, -7.5, 7.5), 0.0], atol=1e-9)
 
 
@@ -241,7 +312,6 @@ def test_configured_anew_it_keeps_the_last_state_and_judges_the_next_by_the_new_
         (1.0, 0.02, 0.9),  # 3 * 2.5 rad/s for 0.02 s of receipt and 0.1 s of state_timeout
         (3600.0, 0.02, 0.9),
         (3600.0, -9.0, 0.75),
-        (3600.0, math.nan, 0.75),
         (0.02, 3600.0, 0.15),
     ],
 )
@@ -293,9 +363,9 @@ def test_whatever_comes_is_rejected_or_read_as_finite_plausible_numbers(metadata
     joint_reader = JointReader(metadata, ControllerConfig(allow_velocity_estimate=True))
     for message in messages:
         try:
-            position, velocity = joint_reader.read(message, message.stamp)
+            heard = joint_reader.read(message, message.stamp)
         except JointStateError:
             continue
-        assert position.shape == velocity.shape == (2,)
-        assert np.isfinite(position).all()
-        assert (np.abs(velocity) <= 7.5).all()
+        if heard is not None and heard.complete:
+            assert np.isfinite(joint_reader.position).all()
+            assert (np.abs(joint_reader.velocity) <= 7.5).all()

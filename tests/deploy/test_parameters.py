@@ -43,7 +43,7 @@ def test_every_field_says_its_unit_range_and_meaning(name):
     assert set(metadata) == {"unit", "low", "high", "description", "choices", "fixed"}
     assert metadata["description"]
     assert isinstance(metadata["unit"], str)
-    if name in FLOATS and name not in ("jump_factor", "reached_hysteresis"):
+    if name in FLOATS and name not in ("jump_factor", "reached_hysteresis", "following_error"):
         assert metadata["unit"]
     if name in NUMBERS:
         assert metadata["low"] <= FIELDS[name].default <= metadata["high"] < math.inf
