@@ -48,6 +48,11 @@ def main(name: str, job: Job, check: Callable[[DictConfig], object]) -> None:
         check: Raises a UserError if a config is bad; it sees every combination before anything is created or runs.
     """
     flags = [argument for argument in sys.argv[1:] if argument.startswith("-")]
+    with guard():
+        if any(flag.startswith("--e") for flag in flags):  # argparse takes the beginning of a flag for the flag
+            raise UserError(
+                "--experimental-rerun reads a pickle, which may run anything; resume=<run> goes on with a run"
+            )
     if set(flags) <= {"-m", "--multirun"}:
         with guard(), _imports():
             config, pinned = _check_all(name, check, overrides(), sweep=bool(flags))
@@ -91,13 +96,19 @@ class guard:  # noqa: N801
         for number, handler in self._before.items():
             signal.signal(number, handler)
         if isinstance(error, UserError):
-            print(f"error: {error}", file=sys.stderr)
+            print(f"error: {_printable(str(error))}", file=sys.stderr)
             sys.exit(2)
         if isinstance(error, OSError):
-            print(f"error: {error.filename or 'the disk'}: {error.strerror or error}", file=sys.stderr)
+            where = str(error.filename or "the disk")
+            print(f"error: {_printable(f'{where}: {error.strerror or error}')}", file=sys.stderr)
             sys.exit(2)
         if isinstance(error, KeyboardInterrupt):
             sys.exit(130)
+
+
+def _printable(text: str) -> str:
+    """Text as one line that a terminal shows and does not obey; names in it may be from a file of anyone's."""
+    return "".join(one if one.isprintable() else one.encode("unicode_escape").decode() for one in text)
 
 
 @contextlib.contextmanager

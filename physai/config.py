@@ -3,14 +3,10 @@
 import contextlib
 import difflib
 import functools
-import importlib
 import importlib.metadata
-import inspect
 import os
 import re
-import types
-import typing
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
@@ -24,17 +20,7 @@ from hydra.errors import HydraException, MissingConfigException, OverrideParseEx
 from hydra.plugins.config_source import ConfigLoadError
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
-from pydantic import (
-    AfterValidator,
-    BaseModel,
-    BeforeValidator,
-    ConfigDict,
-    Field,
-    PydanticSchemaGenerationError,
-    PydanticUndefinedAnnotation,
-    TypeAdapter,
-    ValidationError,
-)
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 
 from physai.errors import UserError
 
@@ -52,6 +38,7 @@ def _whole(value: Any) -> Any:
 
 Seed = Annotated[int, Field(ge=0, lt=2**32)]
 Count = Annotated[int, BeforeValidator(_whole), Field(gt=0)]
+PackageName = Annotated[str, Field(pattern=r"^[A-Za-z_]\w*(\.[A-Za-z_]\w*)*$", max_length=100)]
 PositiveFloat = Annotated[float, Field(gt=0)]
 NonNegativeFloat = Annotated[float, Field(ge=0)]
 
@@ -146,8 +133,13 @@ def set_plugin_defaults() -> None:
 @contextlib.contextmanager
 def initialized(name: str) -> Iterator[ConfigLoader]:
     """Context in which Hydra finds ``conf/``, for the command ``name``; gives what loads configs there."""
-    with initialize_config_dir(str(conf_dir().absolute()), job_name=name, version_base="1.3"):
-        yield GlobalHydra.instance().config_loader()
+    state = GlobalHydra.instance()
+    running, state.hydra = state.hydra, None  # a job of Hydra's may compose, too
+    try:
+        with initialize_config_dir(str(conf_dir().absolute()), job_name=name, version_base="1.3"):
+            yield state.config_loader()
+    finally:
+        state.hydra = running
 
 
 def compose(name: str, overrides: Iterable[str] = (), hydra: bool = False) -> DictConfig:
@@ -244,100 +236,3 @@ def _keys(node: DictConfig, prefix: str = "") -> list[str]:
             if child is not None and not child._is_none():
                 keys += _keys(child, f"{prefix}{key}.")
     return keys
-
-
-def _check_target(node: dict[str, Any], path: str = "") -> dict[str, Any]:
-    """Check the keys and simple values of a ``_target_`` node against the signature of what it names."""
-    name = node.get("_target_")
-    if not isinstance(name, str):
-        raise ValueError(f"{path}: a _target_ is needed, such as torch.optim.Adam")
-    target = _import(name, path)
-    hints, is_open = _parameters(target)
-    node = dict(node)
-    for key, value in list(node.items()):
-        if key in ("_target_", "_partial_"):
-            continue
-        if key not in hints and not is_open:
-            raise ValueError(
-                f": unknown key '{path.lstrip('.')}{'.' if path else ''}{key}' of {name}{nearest(key, hints)}"
-            )
-        if isinstance(value, Mapping) and "_target_" in value:
-            node[key] = _check_target(dict(value), f"{path}.{key}")
-        else:
-            node[key] = _check_value(hints.get(key, Any), value, f"{path}.{key}")
-    return node
-
-
-def _import(name: str, path: str) -> Any:
-    module, _, attribute = name.rpartition(".")
-    while module:
-        try:
-            found = importlib.import_module(module)
-        except ModuleNotFoundError as error:
-            if not f"{module}.".startswith(f"{error.name}."):  # it is there, and needs what is not
-                raise ValueError(f"{path}._target_: {name} needs {not_installed(error.name or module)}") from None
-            outer, _, inner = module.rpartition(".")
-            module, attribute = outer, f"{inner}.{attribute}"
-            continue
-        try:
-            for part in attribute.split("."):
-                found = getattr(found, part)
-        except AttributeError:
-            raise ValueError(
-                f"{path}._target_: {module} has no '{attribute}'{nearest(attribute, dir(found))}"
-            ) from None
-        return found
-    raise ValueError(f"{path}._target_: there is no '{name}'")
-
-
-def _parameters(target: Any) -> tuple[dict[str, Any], bool]:
-    """Names and types of the keyword arguments, those that ``**kwargs`` hands on to base classes included."""
-    functions = (
-        [vars(base)["__init__"] for base in target.__mro__ if "__init__" in vars(base)]
-        if inspect.isclass(target)
-        else [target]
-    )
-    hints: dict[str, Any] = {}
-    for function in functions:
-        parameters = inspect.signature(function).parameters.values()
-        try:
-            types = typing.get_type_hints(function, include_extras=True)
-        except (NameError, TypeError):
-            types = {}
-        for parameter in parameters:
-            if parameter.name != "self" and parameter.kind not in (
-                parameter.VAR_KEYWORD,
-                parameter.VAR_POSITIONAL,
-            ):
-                hints.setdefault(parameter.name, types.get(parameter.name, Any))
-        if not any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters):
-            return hints, False
-    return hints, not inspect.isclass(target)
-
-
-def _check_value(hint: Any, value: Any, path: str) -> Any:
-    """Return the value as its type wants it, so that 1e3 is a count where a count is wanted."""
-    try:
-        adapter = TypeAdapter(_of_any_length(hint), config=ConfigDict(arbitrary_types_allowed=True))
-    except (PydanticSchemaGenerationError, PydanticUndefinedAnnotation, TypeError):
-        return value
-    try:
-        checked = adapter.validate_python(value)
-    except ValidationError as error:
-        message = error.errors()[0]["msg"]
-        raise ValueError(f"{path}: {message[0].lower()}{message[1:]}, got {value!r}") from None
-    return checked if isinstance(checked, int | float | list) else value
-
-
-def _of_any_length(hint: Any) -> Any:
-    """Read ``tuple[float]`` as libraries mean it who give two bounds that type."""
-    arguments = typing.get_args(hint)
-    if typing.get_origin(hint) is tuple and len(arguments) == 1:
-        return tuple[arguments[0], ...]  # type: ignore[valid-type]
-    if typing.get_origin(hint) in (typing.Union, types.UnionType):
-        return typing.Union[tuple(_of_any_length(argument) for argument in arguments)]  # noqa: UP007
-    return hint
-
-
-Target = Annotated[dict[str, Any], AfterValidator(_check_target)]
-"""A node for ``hydra.utils.instantiate``: whatever it names must exist and accept the keys that are given."""

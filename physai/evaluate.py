@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 from omegaconf import DictConfig
 
 from physai import cli
-from physai.config import Config, Count, Seed, validate
+from physai.config import Config, Count, PackageName, Seed, validate
 
 if TYPE_CHECKING:
     from physai.training.run import TrainedPolicy
@@ -17,6 +17,7 @@ class PolicyChoice(Config):
     """Which policy, and the robots that it drives."""
 
     run: str
+    allow: list[PackageName]
     checkpoint: str | int
     env: dict[str, Any] | None
     randomization: dict[str, Any] | None
@@ -25,13 +26,14 @@ class PolicyChoice(Config):
         """Read it; raises a UserError if something is missing or damaged."""
         from physai.envs.simulation import EnvConfig
         from physai.physics import RandomizationConfig
-        from physai.training.run import TrainedPolicy
+        from physai.training.run import TrainedPolicy, load_config
 
+        run_config = load_config(Path(self.run), self.allow)
         env = None if self.env is None else validate(EnvConfig, DictConfig(self.env))
         randomization = None
         if self.randomization is not None:
             randomization = validate(RandomizationConfig, DictConfig(self.randomization))
-        return TrainedPolicy(Path(self.run), str(self.checkpoint), randomization, env)
+        return TrainedPolicy(Path(self.run), str(self.checkpoint), randomization, env, run_config)
 
 
 class EvaluateConfig(PolicyChoice):

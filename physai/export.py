@@ -1,19 +1,23 @@
 """``python -m physai.export``: turn the policy of a run into files for robots (see ``--help``)."""
 
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 from omegaconf import DictConfig
 
 from physai import cli
-from physai.config import Config, validate
+from physai.config import Config, PackageName, validate
 from physai.errors import UserError
+
+if TYPE_CHECKING:
+    from physai.training.config import TrainConfig
 
 
 class ExportConfig(Config):
     """``conf/export.yaml``."""
 
     run: str | None
+    allow: list[PackageName]
     checkpoint: str | int
     format: Literal["torchscript", "onnx", "all"]
     inspect: str | None
@@ -26,7 +30,7 @@ class ExportConfig(Config):
 
 def _check(node: DictConfig) -> None:
     from physai.artifact import onnx
-    from physai.training.run import TrainedPolicy
+    from physai.training.run import TrainedPolicy, load_config
 
     config = validate(ExportConfig, node)
     if (config.run is None) == (config.inspect is None):
@@ -38,7 +42,8 @@ def _check(node: DictConfig) -> None:
         raise UserError(
             f"ONNX needs {', '.join(onnx.missing())}: pip install 'physai[onnx]', or choose format=torchscript"
         )
-    TrainedPolicy(Path(config.run), str(config.checkpoint))
+    run = Path(config.run)
+    TrainedPolicy(run, str(config.checkpoint), config=load_config(run, config.allow))
 
 
 def _export(node: DictConfig, _: Path) -> None:
@@ -49,15 +54,22 @@ def _export(node: DictConfig, _: Path) -> None:
         show(Path(config.inspect))
     else:
         assert config.run is not None
-        export(Path(config.run), str(config.checkpoint), config.formats)
+        from physai.training.run import load_config
+
+        run = Path(config.run)
+        export(run, str(config.checkpoint), config.formats, load_config(run, config.allow))
 
 
-def export(run_dir: Path, which: str, formats: list[str]) -> None:
+def export(run_dir: Path, which: str, formats: list[str], config: "TrainConfig") -> None:
     """Export a policy through the gate, and say what was checked and written."""
     from physai.artifact import FILES, export_policy
 
     print(f"Exporting the {which} policy of {run_dir}:", flush=True)
-    export_policy(run_dir, which, formats, lambda stage, result: print(f"  {stage:<38} {result}", flush=True))
+
+    def report(stage: str, result: str) -> None:
+        print(f"  {stage:<38} {result}", flush=True)
+
+    export_policy(run_dir, which, formats, report, config=config)
     written = [FILES[name] for name in formats]
     print(
         f"Written to {run_dir}: {', '.join(written)}{', policy.pt.sha256' if FILES['torchscript'] in written else ''}"

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 import matplotlib
 import numpy as np
 import pandas as pd
-from omegaconf import OmegaConf
 
+from physai import foreign
 from physai.errors import UserError
 
 matplotlib.use("Agg")
@@ -94,7 +94,11 @@ def _episodes(run: Path) -> pd.DataFrame:
     path = run / "episodes.csv"
     if not path.is_file():
         raise UserError(f"{run}: no run there (it has no episodes.csv)")
-    episodes = pd.read_csv(path)
+    foreign.check_links(run)
+    try:
+        episodes = pd.read_csv(path)[["frame", "return", "length"]].astype(float)
+    except (ValueError, KeyError):
+        raise UserError(f"{path}: the run's episodes are damaged") from None
     if episodes.empty:
         raise UserError(f"{run}: no episode has ended yet, there is nothing to draw")
     return episodes
@@ -102,13 +106,10 @@ def _episodes(run: Path) -> pd.DataFrame:
 
 def _label(run: Path) -> str:
     """What a run is, but for its seed: runs with equal labels are repetitions."""
-    try:
-        overrides = OmegaConf.to_container(OmegaConf.load(run / ".hydra" / "overrides.yaml"))
-        config = OmegaConf.load(run / ".hydra" / "config.yaml")
-    except OSError:
+    if not (run / ".hydra" / "config.yaml").is_file():
         return run.name
-    rest = [item for item in overrides if not item.startswith(("seed=", "env=", "hydra."))]
-    return ", ".join([config.env.name, *rest])
+    rest = [item for item in foreign.read_overrides(run) if not item.startswith(("seed=", "env="))]
+    return ", ".join([foreign.read_name(run), *rest])
 
 
 def _curve(axis: plt.Axes, members: list[pd.DataFrame], column: str, label: str) -> None:

@@ -104,22 +104,26 @@ def begin(folder: Path, config: DictConfig, ranges: Sequence[str], fixed: Sequen
     """
     import optuna
     from optuna.trial import TrialState
-    from sqlalchemy.exc import SQLAlchemyError
 
     os.environ["HYDRA_FULL_ERROR"] = "1"  # for without_result
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     settings, direction = config.hydra.sweeper, config.objective.direction
-    fixed = sorted(one for one in fixed if not one.startswith("hydra"))
+    fixed = sorted(one for one in fixed if not one.startswith(("hydra", "allow=")))
     about = {"fixed": fixed, "ranges": sorted(ranges), "direction": direction}
     storage = f"sqlite:///{folder}/study.db"
     try:
         study = optuna.create_study(study_name=_NAME, storage=storage, direction=direction, load_if_exists=True)
-    except SQLAlchemyError as error:
-        raise UserError(f"{folder}/study.db: no study can be read there: {str(error).splitlines()[0]}") from None
-    if study.user_attrs.get("about", about) != about:
+        trials, found = study.trials, study.user_attrs.get("about", about)
+    except Exception as error:  # whatever SQLite and Optuna make of a file of anyone's
+        reason = (str(error) or type(error).__name__).splitlines()[0]
+        raise UserError(f"{folder}/study.db: no study can be read there: {reason}") from None
+    keys = {one.partition("=")[0] for one in ranges}
+    if found != about or any(not keys.issuperset(trial.params) for trial in trials):
         raise UserError(f"{folder} holds a study of something else: choose another hydra.sweep.dir")
+    if "cmaes" not in config.allow and any(":optimizer" in key for trial in trials for key in trial.system_attrs):
+        raise UserError(f"{folder}/study.db holds a pickle of CMA-ES, which may run anything; yours? allow=[cmaes]")
     study.set_user_attr("about", about)
-    over = [trial for trial in study.trials if trial.state is not TrialState.WAITING]
+    over = [trial for trial in trials if trial.state is not TrialState.WAITING]
     for trial in over:
         if trial.state is TrialState.RUNNING:
             run = folder / str(trial.number)

@@ -79,19 +79,34 @@ class _Training:
 
 
 def _resume(run_dir: Path, given: list[str]) -> None:
+    from physai import foreign
     from physai.config import compose
     from physai.training.run import load_config
 
     if _sweeps():
         raise UserError("resume continues one run; it cannot be swept over")
-    config = load_config(run_dir)
-    if given:
-        overrides = list(OmegaConf.load(run_dir / ".hydra" / "overrides.yaml"))
-        wanted = _config(compose("train", [*overrides, *given]))
+    allow = [name for override in given if override.startswith("allow=") for name in _allowed(override)]
+    others = [override for override in given if not override.startswith("allow=")]
+    config = load_config(run_dir, allow, others, resume=True)
+    if others:
+        path = run_dir / ".hydra" / "overrides.yaml"
+        node = compose("train", [*foreign.read_overrides(run_dir), *others])
+        checked = foreign.checked(OmegaConf.to_container(node), path, allow, others, resume=True)
+        wanted = _config(OmegaConf.create(checked | {"allow": allow}))
         difference = _first_difference(config.model_dump(), wanted.model_dump())
         if difference:
             raise UserError(f"resume={run_dir}: the run has {difference}; a resumed run keeps its config")
     _run(config, run_dir, resume=True)
+
+
+def _allowed(override: str) -> list[str]:
+    """Packages in ``allow=[...]``."""
+    from physai.config import Config, PackageName, compose, validate
+
+    class Allowed(Config):
+        allow: list[PackageName]
+
+    return validate(Allowed, OmegaConf.masked_copy(compose("train", [override]), ["allow"])).allow
 
 
 def _first_difference(run: Any, wanted: Any, key: str = "") -> str | None:
@@ -112,13 +127,13 @@ def _run(config: "TrainConfig", run_dir: Path, resume: bool, agent: "Agent | Non
     try:
         run_training(config, run_dir, resume, agent)
         if not study.is_running():  # of many trials, few are for a robot
-            _export(run_dir, complete)
+            _export(config, run_dir, complete)
     except Interrupted as stopped:
         print(f"\nStopped by {stopped}; everything is saved. Go on with:\n  python -m physai.train resume={run_dir}")
         sys.exit(stopped.exit_code)
 
 
-def _export(run_dir: Path, complete: bool) -> None:
+def _export(config: "TrainConfig", run_dir: Path, complete: bool) -> None:
     """Export the best policy, unless a run that was complete before has its files."""
     from physai.artifact import FILES, onnx
     from physai.export import export
@@ -128,7 +143,7 @@ def _export(run_dir: Path, complete: bool) -> None:
     files = [*(FILES[name] for name in formats), f"{FILES['torchscript']}.sha256"]
     if complete and all((run_dir / name).exists() for name in files):
         return
-    export(run_dir, "best", formats)
+    export(run_dir, "best", formats, config)
     if lacking:
         print(f"No {FILES['onnx']}: it needs {', '.join(lacking)} (pip install 'physai[onnx]')")
 

@@ -2,6 +2,7 @@
 
 import json
 import math
+import pickle
 
 import optuna
 import pytest
@@ -14,6 +15,7 @@ from physai.errors import UserError
 from physai.plotting import plot_study
 from physai.sweep import SweepReport
 from physai.training.config import TrainConfig
+from tests.malicious import Pickled
 
 OPTUNA = "hydra/sweeper=optuna"
 SPACES = sorted(path.stem for path in (conf_dir() / "hydra" / "search").glob("*.yaml"))
@@ -153,3 +155,22 @@ def test_a_study_without_any_value_is_drawn_all_the_same(tmp_path):
     found = study.load(tmp_path)
     found.tell(ask(tmp_path), math.inf)
     plot_study(found, "success rate", {"seed": "seed"}, tmp_path / "study.png")
+
+
+def test_a_study_from_elsewhere_may_hold_no_pickle_and_no_key_of_its_own(tmp_path):
+    mark = tmp_path / "mark"
+    begin(tmp_path)
+    trial = ask(tmp_path)
+    evil = pickle.dumps(Pickled(f"touch {mark}")).hex()
+    storage, number = study.load(tmp_path)._storage, trial._trial_id
+    storage.set_trial_system_attr(number, "cma:optimizer:0", evil)
+    with pytest.raises(UserError, match=r"study\.db holds a pickle of CMA-ES, which may run anything; yours\? allow="):
+        begin(tmp_path)
+    assert not mark.exists()
+    begin(tmp_path, "allow=[cmaes]")
+    other = study.load(tmp_path).ask(
+        {"env.task._target_": optuna.distributions.CategoricalDistribution(["evil.Thing"])}
+    )
+    assert other.params == {"env.task._target_": "evil.Thing"}
+    with pytest.raises(UserError, match="holds a study of something else"):
+        begin(tmp_path, "allow=[cmaes]")

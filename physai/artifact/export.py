@@ -17,6 +17,7 @@ from physai.deploy.metadata import metadata_sha256
 from physai.deploy.policy import load_module
 from physai.seeding import derive
 from physai.training.checkpoint import write
+from physai.training.config import TrainConfig
 from physai.training.run import TrainedPolicy, git_commit
 
 FILES = {"torchscript": "policy.pt", "onnx": "policy.onnx"}
@@ -32,6 +33,7 @@ def export_policy(
     formats: Sequence[str],
     report: Callable[[str, str], None] = lambda stage, result: None,
     episodes: int = EPISODES,
+    config: TrainConfig | None = None,
 ) -> Metadata:
     """Export a policy of a run into its folder, through the gate.
 
@@ -41,6 +43,7 @@ def export_policy(
         formats: Keys of ``FILES``.
         report: Called with the name of each stage that was passed, and how.
         episodes: How many the artifact drives.
+        config: The run's, where it is known; None reads it from the run folder.
 
     Returns:
         What the files say about themselves.
@@ -49,7 +52,7 @@ def export_policy(
         GateError: If any two forms of the policy disagree; nothing is written.
         UserError: If there is no such policy, or it cannot be exported.
     """
-    trained = TrainedPolicy(run_dir, which)
+    trained = TrainedPolicy(run_dir, which, config=config)
     actor, env = trained.deploy(_ROBOTS, SEED)
     try:
         policy = make_deployable(actor, env)

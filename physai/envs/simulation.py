@@ -1,20 +1,31 @@
 """N robots at a task: the core that the TorchRL and the Gymnasium shells share."""
 
 import math
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
-from hydra.utils import get_object, instantiate
+from pydantic import AfterValidator
 from torch import Tensor
 
-from physai.config import Config, Count, PositiveFloat, Target
+from physai.config import Config, Count, PositiveFloat
 from physai.errors import UserError
 from physai.physics import ParameterLayout, Physics
 from physai.physics.viewer import Viewer
 from physai.robots import ForwardKinematics, RobotConfig, RobotSpec, TipPosition
+from physai.targets import Target, find, make
 
 _STATE = ("goal", "episode_length", "episode_return", "physics_parameters")  # beside what the physics holds
+
+
+_TASK = ("check", "goal_size", "max_steps", "observation", "sample_goal", "sample_start", "success", "reward")
+_PHYSICS = ("reset", "step", "joint_state", "close")
+
+
+def _says_whether_simulated(node: dict[str, Any]) -> dict[str, Any]:
+    if not isinstance(getattr(find(node["_target_"]), "simulated", None), bool):
+        raise ValueError(f"._target_: {node['_target_']} is no physics: it does not say whether it is 'simulated'")
+    return node
 
 
 class EnvConfig(Config):
@@ -27,7 +38,7 @@ class EnvConfig(Config):
     name: str
     robot: RobotConfig
     task: Target
-    physics: Target
+    physics: Annotated[Target, AfterValidator(_says_whether_simulated)]
     control_dt: PositiveFloat
     substeps: Count
     max_velocity: PositiveFloat
@@ -35,7 +46,7 @@ class EnvConfig(Config):
     @property
     def simulated(self) -> bool:
         """Whether there can be many of its robots, which are put anywhere and given other dynamics."""
-        return bool(get_object(self.physics["_target_"]).simulated)
+        return bool(find(self.physics["_target_"]).simulated)
 
 
 class _Rows:
@@ -90,7 +101,7 @@ class Simulation:
         self._tip = TipPosition(self.kinematics)
         self._continuous = self.spec.continuous.nonzero()[0].tolist()
         self.layout = ParameterLayout(self.spec)
-        self.task = instantiate(config.task, _convert_="all")
+        self.task = make("env.task", config.task, needs=_TASK)
         self.task.check(self.spec, self.kinematics)
         if config.max_velocity > self.spec.velocity_limit.min():
             raise UserError(
@@ -98,11 +109,8 @@ class Simulation:
                 f"{self.spec.velocity_limit.min():g} rad/s"
             )
         self.observation = self.task.observation(self.spec, self.kinematics)
-        make_physics = instantiate(config.physics, _partial_=True, _convert_="all")
-        try:
-            self.physics: Physics = make_physics(self.spec, num_envs, config.control_dt, config.substeps)
-        except TypeError as error:  # arguments that are missing
-            raise UserError(f"env.physics: {error}") from None
+        sizes = num_envs, config.control_dt, config.substeps
+        self.physics: Physics = make("env.physics", config.physics, self.spec, *sizes, needs=_PHYSICS)
         self.generator = torch.Generator()
         self.seed(seed)
         joints = len(self.spec.joints)

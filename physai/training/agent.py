@@ -9,8 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from hydra.errors import InstantiationException
-from hydra.utils import instantiate
 from tensordict.nn import TensorDictModuleBase
 from torchrl.data import Composite
 from torchrl.record.loggers import TensorboardLogger
@@ -22,9 +20,12 @@ from physai.errors import UserError
 from physai.physics import RandomizationConfig
 from physai.policies import input_size
 from physai.seeding import derive
+from physai.targets import make
 from physai.training.config import TrainConfig
 
 logging.getLogger("torchrl").setLevel(logging.WARNING)  # at INFO it reports every storage that it allocates
+
+_NETWORK = ("in_keys", "out_keys", "parameters", "state_dict")
 
 
 @dataclass
@@ -59,11 +60,12 @@ class Agent:
         env = make_robots(config.collector.robots_here, derive(config.seed, "train"))
         actor = make_actor(config, env).to(device)
         judged = Composite(**env.observation_spec, **env.full_action_spec, shape=env.batch_size)
-        inputs = input_size(judged, config.policy.critic["in_keys"], "policy.critic")
-        critic = _make("policy.critic", config.policy.critic, in_features=inputs).to(device)
-        algorithm = _make(
+        inputs = input_size(judged, _in_keys(config.policy.critic, "policy.critic"), "policy.critic")
+        critic = make("policy.critic", config.policy.critic, needs=_NETWORK, in_features=inputs).to(device)
+        algorithm = make(
             "algo",
             config.algo,
+            needs=("update", "weights", "state", "set_state", "warmup_frames"),
             networks=Networks(actor, critic, env.normalization.normalizer),
             frames_per_batch=config.collector.frames_per_batch,
         )
@@ -112,11 +114,19 @@ class Agent:
 
 def make_actor(config: TrainConfig, env: TransformedRobotEnv) -> TensorDictModuleBase:
     """Build an untrained actor for an env."""
-    inputs = input_size(env.observation_spec, config.policy.actor["in_keys"], "policy.actor")
-    actor = _make("policy.actor", config.policy.actor, in_features=inputs, action_size=env.action_spec.shape[-1])
+    inputs = input_size(env.observation_spec, _in_keys(config.policy.actor, "policy.actor"), "policy.actor")
+    sizes = {"in_features": inputs, "action_size": env.action_spec.shape[-1]}
+    actor = make("policy.actor", config.policy.actor, needs=(*_NETWORK, "deterministic"), **sizes)
     if getattr(actor, "memory_size", 0) != config.policy.memory_size:  # the env is made first, from the config
         raise UserError("policy.actor: how much an actor remembers is its argument memory_size")
     return actor
+
+
+def _in_keys(node: dict[str, Any], where: str) -> list[str]:
+    keys = node.get("in_keys")
+    if not isinstance(keys, list) or not all(isinstance(key, str) for key in keys):
+        raise UserError(f"{where}.in_keys: a list of keys of the env is needed")
+    return keys
 
 
 def load_policy_state(actor: TensorDictModuleBase, env: TransformedRobotEnv, state: dict[str, Any]) -> None:
@@ -124,8 +134,9 @@ def load_policy_state(actor: TensorDictModuleBase, env: TransformedRobotEnv, sta
     try:
         actor.load_state_dict(state["actor"])
         env.normalization.load_state_dict(state["normalization"])
-    except (RuntimeError, KeyError, TypeError) as error:
-        raise UserError(f"the checkpoint does not fit the run's config: {str(error).splitlines()[0][:120]}") from None
+    except (RuntimeError, LookupError, TypeError, ValueError, AttributeError) as error:
+        reason = (str(error) or type(error).__name__).splitlines()[0][:120]
+        raise UserError(f"the checkpoint does not fit the run's config: {reason}") from None
 
 
 def make_evaluation_env(
@@ -138,9 +149,9 @@ def make_evaluation_env(
 
 def make_logger(config: TrainConfig, run_dir: Path) -> Any:
     """Build the TorchRL logger, and tell it the config."""
-    logger = _make("logger", config.logger, log_dir=str(run_dir))
+    logger = make("logger", config.logger, needs=("log_metrics", "log_hparams"), log_dir=str(run_dir))
     if not isinstance(logger, TensorboardLogger):  # which would show the config as a run of its own
-        logger.log_hparams(_flat(config.model_dump(exclude={"logger", "resume"})))
+        logger.log_hparams(_flat(config.model_dump(exclude={"logger", "resume", "allow"})))
     return logger
 
 
@@ -150,15 +161,3 @@ def _flat(node: dict[str, Any], prefix: str = "") -> dict[str, Any]:
     for key, value in node.items():
         leaves |= _flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {f"{prefix}{key}": value}
     return leaves
-
-
-def _make(where: str, node: dict[str, Any], **parts: Any) -> Any:
-    try:
-        return instantiate(node, _partial_=True, _convert_="all")(**parts)  # Hydra would make dicts of dataclasses
-    except InstantiationException as error:
-        cause = error.__cause__ or error
-        if isinstance(cause, UserError):
-            raise cause from None
-        raise UserError(f"{where}: {' '.join(str(cause).split())}") from None
-    except (TypeError, ValueError, AttributeError, ImportError) as error:
-        raise UserError(f"{where}: {' '.join(str(error).split())}") from None

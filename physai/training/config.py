@@ -5,10 +5,11 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 
 from physai.collectors import CollectorConfig
-from physai.config import Config, Count, Seed, Target
+from physai.config import Config, Count, PackageName, Seed
 from physai.envs.make import NormalizationConfig
 from physai.envs.simulation import EnvConfig
 from physai.physics import RandomizationConfig
+from physai.targets import Target
 
 
 class CheckpointConfig(Config):
@@ -70,3 +71,4 @@ class TrainConfig(Config):
     device: Annotated[str, Field(pattern=r"^(cpu|cuda(:\d+)?)$")]
     threads: Count
     resume: None  # the command takes it before a config is made
+    allow: list[PackageName]  # for resume: what a new run names is the user's own

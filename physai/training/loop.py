@@ -226,8 +226,9 @@ def _restore(agent: Agent, content: dict[str, Any]) -> tuple[Clock, dict[str, An
         torch.set_rng_state(content["random"])
         torch.cuda.set_rng_state_all(content["random_on_gpus"])
         return Clock(**content["clock"]), content["log"]
-    except (RuntimeError, KeyError, TypeError, ValueError) as error:
-        raise UserError(f"the checkpoint does not fit the run's config: {str(error).splitlines()[0][:120]}") from None
+    except (RuntimeError, LookupError, TypeError, ValueError, AttributeError) as error:
+        reason = (str(error) or type(error).__name__).splitlines()[0][:120]
+        raise UserError(f"the checkpoint does not fit the run's config: {reason}") from None
 
 
 def _keep_evidence(error: NonFiniteError, clock: Clock, run_dir: Path, folder: checkpoint.CheckpointFolder) -> str:

@@ -2,14 +2,16 @@
 
 import json
 import subprocess
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from omegaconf import OmegaConf
+from omegaconf import DictConfig
 from rich.console import Console
 from rich.table import Table
 from tensordict.nn import TensorDictModuleBase
 
+from physai import foreign
 from physai.config import validate
 from physai.envs.make import TransformedRobotEnv
 from physai.envs.simulation import EnvConfig
@@ -25,22 +27,25 @@ from physai.training.loop import Clock, Interrupted, stop_signals, train
 FINAL_SEED = derive(0, "final evaluation goals")
 
 
-def load_config(run_dir: Path) -> TrainConfig:
-    """Read the config of a run.
+def load_config(
+    run_dir: Path, allow: Sequence[str] = (), given: Sequence[str] = (), resume: bool = False
+) -> TrainConfig:
+    """Read the config of a run, which may be from elsewhere.
+
+    Args:
+        run_dir: The run folder.
+        allow: Packages whose parts it may name beside physai's, TorchRL's and torch's.
+        given: The user's overrides of ``conf/train.yaml``.
+        resume: Whether the run will go on.
 
     Raises:
-        UserError: If there is no run, or its config is damaged.
+        UserError: If there is no run, its config is damaged, or it names what it may not (:mod:`physai.foreign`).
     """
-    path = run_dir / ".hydra" / "config.yaml"
-    if not path.is_file():
-        raise UserError(f"{run_dir}: no run there (it has no .hydra/config.yaml)")
+    node = foreign.read_config(run_dir, allow, given, resume) | {"allow": list(allow)}
     try:
-        node = OmegaConf.load(path)
-    except Exception as error:  # whatever YAML makes of a truncated file
-        raise UserError(f"{path}: the run's config is damaged ({' '.join(str(error).split())[:80]})") from None
-    try:
-        return validate(TrainConfig, node)
+        return validate(TrainConfig, DictConfig(node))
     except UserError as error:
+        path = run_dir / ".hydra" / "config.yaml"
         raise UserError(f"{path}: the run's config is damaged or from another version: {error}") from None
 
 
@@ -58,14 +63,17 @@ def run_training(
     done = run_dir / "summary.json"
     if resume and done.is_file():
         print(f"{run_dir} is complete already.")
-        summary = json.loads(done.read_text())
-        print_summary(summary, f"{run_dir}")
+        try:
+            summary = json.loads(done.read_text())
+            print_summary(summary, f"{run_dir}")
+        except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
+            raise UserError(f"{done}: the run's summary is damaged") from None
         return summary
     with stop_signals() as stop:
         agent, clock = train(config, run_dir, resume, stop, agent)
         print(f"Judging the best policy on {config.evaluation.episodes:,} goals it has never seen ...", flush=True)
         try:
-            result = TrainedPolicy(run_dir, "best").evaluate(config.evaluation.episodes)
+            result = TrainedPolicy(run_dir, "best", config=config).evaluate(config.evaluation.episodes)
             summary = _summary(config, agent, clock, result)
         finally:
             agent.close()
@@ -92,6 +100,7 @@ class TrainedPolicy:
         randomization: How robots differ; None takes the run's own evaluation, or none for robots that are not
             simulated.
         env: What it drives; None takes the run's own.
+        config: The run's, where it is known; None reads it from the run folder, and trusts it with nothing.
 
     Attributes:
         config: The run's, with that env.
@@ -107,8 +116,9 @@ class TrainedPolicy:
         which: str,
         randomization: RandomizationConfig | None = None,
         env: EnvConfig | None = None,
+        config: TrainConfig | None = None,
     ) -> None:
-        self.config = load_config(run_dir)
+        self.config = config or load_config(run_dir)
         own = self.config.evaluation.randomization
         if env is not None:
             trained, given = self.config.env.robot.joints, env.robot.joints
@@ -118,7 +128,9 @@ class TrainedPolicy:
             own = own if env.simulated else RandomizationConfig.none()
         self.randomization = randomization or own
         self._state = checkpoint.load(checkpoint.CheckpointFolder(run_dir / "checkpoints", 1).find(which))
-        self.frames = int(self._state["frames"])
+        self.frames = self._state.get("frames")
+        if type(self.frames) is not int:
+            raise UserError(f"{run_dir}: the checkpoint '{which}' does not say how many frames it has learned from")
 
     def deploy(self, num_envs: int, seed: int) -> tuple[TensorDictModuleBase, TransformedRobotEnv]:
         """Build the actor, and an env with the statistics that it was trained with."""
