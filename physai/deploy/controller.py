@@ -145,17 +145,22 @@ class Controller:
         self._counters["emergency stops"] += 1
         self._latched, self._latch_reason = State.ESTOP, "emergency stop"
 
-    def reset(self) -> None:
+    def reset(self) -> bool:
         """Leave a fault, an emergency stop or a goal given up for a hold, which ends when the robot is seen to be well.
 
         The goal is forgotten: a reset permits motion, a new goal starts it.
+
+        Returns:
+            Whether there was anything to leave.
         """
-        if self._latched is not None or self._gave_up:
-            self._latched = None
-            self._strain.restart()
-            self.forget_goal()
-            self._failures = 0
-            self._needed = self.config.recovery_states
+        if self._latched is None and not self._gave_up:
+            return False
+        self._latched = None
+        self._strain.restart()
+        self.forget_goal()
+        self._failures = 0
+        self._needed = self.config.recovery_states
+        return True
 
     def forget_goal(self) -> None:
         """Wait for a new goal."""
@@ -292,10 +297,10 @@ class Controller:
             reasons += ["no joint state yet" if missing is None else f"no state of '{missing}' yet", *interlocks]
             return State.WAITING
         if self._needed:
-            reasons.append(f"{self._needed} more good joint states are needed")
+            reasons += [f"{self._needed} more good joint states are needed", *interlocks]
             return State.HOLD
         if self._gave_up:
-            reasons.append(self._gave_up)
+            reasons += [self._gave_up, *interlocks]
             return State.HOLD
         reasons += interlocks
         if self._goal is None:

@@ -97,7 +97,7 @@ class Following:
             self._sample, passed = sample, 1.0
         rows = self._rows
         while self._seen < self._told and (at := self._start + (self._seen + 1) * self._period) <= received:
-            share = (at - self._sample_at) / passed if self._rows > 1 else 1.0
+            share = (at - self._sample_at) / passed if self._sample_at > -math.inf else 1.0
             self._seen += 1
             self._measured[:-1] = self._measured[1:]
             self._measured[-1] = self._sample + (sample - self._sample) * share

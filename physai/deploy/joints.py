@@ -152,7 +152,6 @@ class JointReader:
         if not now - received <= self._timeout:  # also where it is NaN
             raise JointStateError("old on arrival", f"it is {now - received:.3f} s old", implausible=True)
         self.position[joints], self.velocity[joints] = position, velocity
-        self._travel[joints] += moved
         if self.feels or effort is not None:
             self.feels = True
             self.effort[joints] = math.nan if effort is None else effort
@@ -209,6 +208,7 @@ class JointReader:
             raise JointStateError(
                 "position jump", f"'{name}' jumped by {moved[joint]:.3f} rad in {elapsed[joint]:.3f} s", True
             )
+        self._travel[joints] += moved  # also where the rest of the state is refused: it is gone
         return moved, elapsed
 
     def _check_velocity(

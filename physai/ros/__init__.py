@@ -9,6 +9,7 @@ import sys
 from typing import Any
 
 from physai.errors import UserError
+from physai.ros import outlet, signals
 
 # Imported when they are asked for: the nodes need no gymnasium, and this package no ROS.
 _HOMES = {"RosPhysics": "physai.ros.physics", "RosReacherEnv": "physai.ros.gym_env"}
@@ -16,7 +17,10 @@ _HOMES = {"RosPhysics": "physai.ros.physics", "RosReacherEnv": "physai.ros.gym_e
 
 _WITHOUT_ROS = "rclpy is not installed: pip install 'physai[ros]', or source ROS 2 Jazzy"
 
-if sys.argv[:1] == ["-m"] and importlib.util.find_spec("rclpy") is None:  # python -m physai.ros.<node>
+outlet.open_closed()
+if sys.argv[:1] == ["-m"]:  # python -m physai.ros.<node>
+    signals.end_quietly()
+if sys.argv[:1] == ["-m"] and importlib.util.find_spec("rclpy") is None:
     print(f"error: {_WITHOUT_ROS}", file=sys.stderr)
     sys.exit(2)
 

@@ -1,9 +1,10 @@
 """A relay before a controller that has no timeout: when commands stop, it goes on with zeros.
 
-The inference node publishes to ~/commands (remap its /joint_velocity_controller/commands to
-/command_watchdog/commands); this node passes commands on. It sends zeros when none has come for a while, and, until
-~/reset, when another publisher has commanded the controller. It listens only while a controller listens to it, so that
-who commands it knows. Run it on the robot's side of whatever may fail.
+The inference node (with -p watchdog:=/command_watchdog) publishes to ~/commands; this node passes commands on. It sends
+zeros when none has come for a while, and, until ~/reset, when another publisher has commanded the controller: one that
+does not publish ~/commands, too. It listens only while a controller listens to it, so that who commands it knows. It
+publishes ~/heartbeat, so that who commands it can stop the arm when it hangs or dies. Run it on the robot's side of
+whatever may fail.
 """
 
 import math
@@ -13,7 +14,7 @@ from dataclasses import dataclass
 
 from rclpy.clock import Clock, ClockType
 from rclpy.subscription import Subscription
-from std_msgs.msg import Float64MultiArray
+from std_msgs.msg import Empty, Float64MultiArray
 from std_srvs.srv import Trigger
 
 from physai.deploy.parameters import Parameters, parameter
@@ -28,7 +29,7 @@ class WatchdogConfig(Parameters):
     """Parameters of the watchdog."""
 
     timeout: float = parameter(0.1, "without a command for this long, the arm stops", "s", 0.01, 10.0)
-    rate_hz: float = parameter(50.0, "zeros per second", "Hz", 1.0, 1000.0, fixed=True)
+    rate_hz: float = parameter(50.0, "zeros per second, and heartbeats", "Hz", 1.0, 1000.0, fixed=True)
     joints: int = parameter(
         0, "velocities in a command: zeros come from the start; 0: from the first command on", "", 0, 1000, fixed=True
     )
@@ -40,7 +41,9 @@ class CommandWatchdog(StoppableNode):
     def __init__(self) -> None:
         super().__init__("command_watchdog")
         self._config = config = declare(self, WatchdogConfig, self._configure)
-        self._commands = VelocityCommands(self, config.joints)
+        # Before the commands: who hears of these knows then that they are ours.
+        self._heartbeat = self.create_publisher(Empty, "~/heartbeat", qos.COMMAND, event_callbacks=qos.SILENT_PUBLISHER)
+        self._commands = VelocityCommands(self, config.joints, partners="~/commands")
         self._joints = config.joints
         self._source: Subscription | None = None
         self._last = -math.inf
@@ -56,38 +59,44 @@ class CommandWatchdog(StoppableNode):
     def _configure(self, config: WatchdogConfig) -> None:
         self._config = config
 
-    def _relay(self, message: Float64MultiArray) -> None:
+    def _relay(self, message: Float64MultiArray, info: dict[str, int]) -> None:
         self._look()
         velocity = message.data.tolist()
         sound = len(velocity) > 0 and all(map(math.isfinite, velocity))
         if not self._joints and sound:
             self._joints = len(velocity)
             self._commands.resize(self._joints)
-        now = time.monotonic()
-        if now < self._deaf_until:
+        if time.monotonic() < self._deaf_until:
             return
-        self._last = now
+        self._last = qos.received_at(info)
         if self._conflict:
             self._stop(self._conflict)
         elif not sound or len(velocity) != self._joints:
             self._stop(f"{velocity} is no command for {self._joints} joints")
         else:
+            self._commands.send(velocity)
             if self._reason:
                 self.get_logger().info("passing commands on again")
             self._reason = ""
-            self._commands.send(velocity)
 
     def _check(self) -> None:
         self._look()
-        if self._commands.heard and self._source is None:
-            self._source = self.create_subscription(Float64MultiArray, "~/commands", self._relay, qos.COMMAND)
-        elif not self._commands.heard and self._source is not None:
-            self.destroy_subscription(self._source)
-            self._source = None
         if self._conflict:
             self._stop(self._conflict)
         elif time.monotonic() - self._last > self._config.timeout:
             self._stop(f"no command for {self._config.timeout:g} s")
+        self._heartbeat.publish(Empty())
+        heard = self._commands.unheard is None
+        if heard and self._source is None:
+            self._source = self.create_subscription(
+                Float64MultiArray,
+                "~/commands",
+                self._relay,  # type: ignore[arg-type]  # rclpy also takes callbacks with two arguments
+                qos.COMMAND,
+            )
+        elif not heard and self._source is not None:
+            self.destroy_subscription(self._source)
+            self._source = None
 
     def _look(self) -> None:
         now = time.monotonic()
@@ -96,7 +105,7 @@ class CommandWatchdog(StoppableNode):
             self._deaf_until = now + self._config.timeout
         self._looked = now
         if rival := self._commands.rival:
-            self._conflict = f"another publisher commands {self._commands.topic}: {rival}; until ~/reset"
+            self._conflict = f"{rival}; until ~/reset"
 
     def _reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         self._conflict = ""
@@ -107,10 +116,10 @@ class CommandWatchdog(StoppableNode):
     def _stop(self, reason: str) -> None:
         if not self._joints:
             return
+        self._commands.stop()
         if reason != self._reason:
             self.get_logger().error(f"zero velocity: {reason}")
         self._reason = reason
-        self._commands.stop()
 
     def finish(self) -> None:
         """See that the last command that the robot got is zero."""

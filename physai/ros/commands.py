@@ -1,5 +1,6 @@
 """Velocity commands to a controller: is it there, is it ours alone, and do they end with zero."""
 
+import math
 import time
 from array import array
 from collections.abc import Sequence
@@ -9,6 +10,7 @@ from rclpy.node import Node
 from std_msgs.msg import Float64MultiArray
 
 from physai.ros import qos
+from physai.ros.companions import Companions
 
 TOPIC = "/joint_velocity_controller/commands"
 _LAST_ZEROS, _PERIOD = 5, 0.02  # s
@@ -21,12 +23,22 @@ class VelocityCommands:
     Args:
         node: Whose remaps hold.
         joints: How many velocities a command has.
+        topic: Where to.
+        partners: Who publishes this other topic may publish here, too; empty if nobody may.
+
+    Attributes:
+        timeout: A way to the controller that was silent for longer is lost, s; of use where it tells that it lives.
+        silences: How often it was lost.
     """
 
-    def __init__(self, node: Node, joints: int) -> None:
-        self._node = node
-        self._publisher = node.create_publisher(Float64MultiArray, TOPIC, qos.COMMAND)
+    timeout, silences = math.inf, 0
+
+    def __init__(self, node: Node, joints: int, topic: str = TOPIC, partners: str = "") -> None:
+        self._publisher = node.create_publisher(
+            Float64MultiArray, topic, qos.COMMAND, event_callbacks=qos.SILENT_PUBLISHER
+        )
         self.topic: str = self._publisher.topic_name
+        self._companions = Companions(node, self.topic, partners)
         self._message = Float64MultiArray()
         self.resize(joints)
 
@@ -36,17 +48,18 @@ class VelocityCommands:
 
     @property
     def rival(self) -> str | None:
-        """Another publisher of the same topic, or None."""
-        if self._node.count_publishers(self.topic) <= 1:
-            return None
-        names = [info.node_name for info in self._node.get_publishers_info_by_topic(self.topic)]
-        others = [name for name in names if name != self._node.get_name()] or ["a node of the same name"]
-        return ", ".join(sorted(others))
+        """That another publisher commands, and who; or None."""
+        others = self._companions.others()
+        return f"another publisher commands {self.topic}: {', '.join(others)}" if others else None
+
+    def silence(self, now: float) -> str | None:
+        """That commands are lost on their way at a time, s, though somebody listens; or None."""
+        return None
 
     @property
-    def heard(self) -> bool:
-        """Whether a controller listens."""
-        return self._publisher.get_subscription_count() > 0
+    def unheard(self) -> str | None:
+        """That no controller listens, or None."""
+        return None if self._publisher.get_subscription_count() else f"no controller listens to {self.topic}"
 
     def send(self, velocity: Sequence[float]) -> None:
         """Publish a command."""
@@ -63,4 +76,8 @@ class VelocityCommands:
         for _ in range(_LAST_ZEROS):
             self.stop()
             time.sleep(_PERIOD)
+        self.wait()
+
+    def wait(self) -> None:
+        """Wait until the last command has arrived where it can, for half a second at most."""
         self._publisher.wait_for_all_acked(Duration(seconds=_ACKNOWLEDGED))

@@ -1,6 +1,7 @@
 """``python -m physai.ros.demo``: an exported policy drives the virtual robot over ROS 2 (see ``--help``)."""
 
 import os
+import signal
 import sys
 import tempfile
 from contextlib import ExitStack
@@ -127,4 +128,6 @@ def _demo(node: DictConfig, _: Path) -> None:
 
 
 if __name__ == "__main__":
+    if signal.getsignal(signal.SIGINT) is signal.SIG_DFL:  # as physai.ros wants it while a node is importing
+        signal.signal(signal.SIGINT, signal.default_int_handler)
     cli.main("demo", _demo, _check)

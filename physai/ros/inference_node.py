@@ -7,24 +7,29 @@ from dataclasses import dataclass
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PointStamped
 from rclpy.clock import Clock, ClockType
-from rclpy.event_handler import SubscriptionEventCallbacks
-from sensor_msgs.msg import JointState as JointStateMessage
 from std_msgs.msg import Bool, String
 from std_srvs.srv import SetBool, Trigger
 
-from physai.deploy import Command, Controller, ControllerConfig, Goal, JointState, Policy, State, load_policy
+from physai.deploy import Command, Controller, ControllerConfig, Goal, Policy, State, load_policy
 from physai.deploy.goals import GoalError, accept
 from physai.deploy.parameters import parameter
 from physai.errors import UserError
-from physai.ros import qos
+from physai.ros import outlet, qos
 from physai.ros.commands import VelocityCommands
 from physai.ros.diagnostics import Timing, diagnose
+from physai.ros.emergency_stop import TOPIC as EMERGENCY_STOP
+from physai.ros.emergency_stop import EmergencyStopTopic
+from physai.ros.estop_file import EmergencyStopFile
+from physai.ros.joint_states import JointStates
 from physai.ros.parameters import declare
-from physai.ros.run import StoppableNode, run
+from physai.ros.run import StoppableNode, brief, run
+from physai.ros.watched_commands import WatchedCommands
 
 # Nodes without our settings of Fast DDS may be found only by its second heartbeat: 2.9 s were measured. And when a
 # controller returns, an emergency stop or another node that commands may be found after it.
 _DISCOVERY, _REDISCOVERY = 3.0, 0.5  # s
+_DISK = 1.0  # s that the file of an emergency stop may take at the end
+_ANY = "any"
 
 
 @dataclass(frozen=True)
@@ -32,7 +37,7 @@ class InferenceConfig(ControllerConfig):
     """Parameters of the inference node: those of the controller, and these."""
 
     policy_path: str = parameter("", "policy.pt of a run (required)", fixed=True)
-    policy_sha256: str = parameter("", "its hash, which proves where it comes from", fixed=True)
+    policy_sha256: str = parameter(_ANY, "its hash, which proves where it comes from", fixed=True)
     joints: tuple[str, ...] = parameter(
         (), "joints of the commands, in the controller's order; empty: the policy's", fixed=True
     )
@@ -42,6 +47,10 @@ class InferenceConfig(ControllerConfig):
     goal: tuple[float, ...] = parameter(
         (), "x and y of a goal to start with, in the policy's frame; empty: none", "m", -100.0, 100.0, fixed=True
     )
+    watchdog: str = parameter(
+        "", "the command_watchdog that passes commands on, such as /command_watchdog; empty: none", fixed=True
+    )
+    watchdog_timeout: float = parameter(0.1, "a watchdog silent for this long does not answer", "s", 0.01, 10.0)
 
 
 class InferenceNode(StoppableNode):
@@ -55,14 +64,15 @@ class InferenceNode(StoppableNode):
         super().__init__("inference_node")
         self._started = time.monotonic()
         self._unheard = self._started  # when no controller listened, for the last time
-        self.config = config = declare(self, InferenceConfig, lambda changed: self._controller.configure(changed))
+        self.config = config = declare(self, InferenceConfig, self._configure)
         policy = _load(config)
         self._controller = Controller(policy, config)
         self._goal = _first_goal(config, policy)
-        self._joint_state: JointState | None = None
-        self._stamp_age: float | None = None  # s; of use where the robot's clock agrees with ours
+        self._robot = JointStates(self, policy.metadata.joints, self._on_joint_states)
         self._command = Command(None, State.WAITING, ())
-        self._enabled = config.autostart
+        self._stop_file = EmergencyStopFile(self.get_fully_qualified_name(), self.context.get_domain_id())
+        self._enabled = config.autostart and not self._stop_file.unusable
+        self._disabled = "not enabled"
         self._publishing = False  # whether this node has a say in what the arm does
         self._contested = False
         self._blocked: list[str] = []  # by interlocks
@@ -72,22 +82,12 @@ class InferenceNode(StoppableNode):
         self._index = [joints.index(joint) for joint in policy.metadata.joints]
         self._velocity = [0.0] * len(joints)
 
-        self._commands = VelocityCommands(self, len(joints))
+        self._commands = _commands(self, len(joints), config)
         self._states = self.create_publisher(String, "~/state", qos.LATCHED)
         self._estopped = self.create_publisher(Bool, "~/estopped", qos.LATCHED)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
-        self.create_subscription(
-            JointStateMessage,
-            "/joint_states",
-            self._take_joint_state,  # type: ignore[arg-type]  # rclpy also takes callbacks with two arguments
-            qos.SENSOR,
-        )
         self.create_subscription(PointStamped, "~/goal", self._take_goal, 1)
-        for profile in qos.EMERGENCY:
-            silent = SubscriptionEventCallbacks(incompatible_qos=lambda _: None, use_default_callbacks=False)
-            self.create_subscription(
-                Bool, "/emergency_stop", self._take_emergency_stop, profile, event_callbacks=silent
-            )
+        self._stop_topic = EmergencyStopTopic(self, lambda: self._emergency_stop(f"by {EMERGENCY_STOP}"))
         self.create_service(SetBool, "~/enable", self._enable)
         self.create_service(Trigger, "~/estop", self._estop)
         self.create_service(Trigger, "~/reset", self._reset)
@@ -96,19 +96,25 @@ class InferenceNode(StoppableNode):
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(1.0 / config.rate_hz, self._on_timer, clock=steady)
         self.create_timer(1.0, self._diagnose, clock=steady)
-        self._announce()
+        if self._stop_file.unusable and config.autostart:
+            self._disabled += f": no autostart, as an emergency stop would not outlive it: {self._stop_file.unusable}"
+            self.get_logger().error(self._disabled)
+        if self._stop_file.stopped:
+            self._emergency_stop("before this start")
+        else:
+            self._announce()
         self.get_logger().info(
             f"{config.policy_path} drives {list(policy.metadata.joints)} of '{policy.metadata.robot}', at most "
             f"{config.max_velocity:g} rad/s; " + ("starting by itself" if self._enabled else "waiting for ~/enable")
         )
 
+    def _configure(self, changed: InferenceConfig) -> None:
+        self._controller.configure(changed)
+        self._commands.timeout = changed.watchdog_timeout
+
     # What comes in
 
-    def _take_joint_state(self, message: JointStateMessage, info: dict[str, int]) -> None:
-        stamp = message.header.stamp.sec + message.header.stamp.nanosec * 1e-9
-        received = qos.received_at(info)
-        self._stamp_age = self.get_clock().now().nanoseconds * 1e-9 - stamp
-        self._joint_state = JointState(message.name, message.position, message.velocity, stamp, received)
+    def _on_joint_states(self) -> None:
         if self.config.trigger == "joint_state":
             self._late = 1.5 / self.config.rate_hz
             self._timing.tick(time.monotonic())
@@ -117,13 +123,9 @@ class InferenceNode(StoppableNode):
     def _take_goal(self, message: PointStamped) -> None:
         self._goal = Goal([message.point.x, message.point.y], message.header.frame_id)
 
-    def _take_emergency_stop(self, message: Bool) -> None:
-        if message.data:
-            self._emergency_stop("/emergency_stop")
-
     def _enable(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
         if not request.data:
-            self._enabled = False
+            self._enabled, self._disabled = False, "not enabled"
             self._tick()
             response.success, response.message = True, "disabled: zero velocity"
             return response
@@ -136,15 +138,18 @@ class InferenceNode(StoppableNode):
         return response
 
     def _estop(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        self._emergency_stop("~/estop")
+        self._emergency_stop("by ~/estop")
         response.success, response.message = True, "stopped until ~/reset"
         return response
 
     def _reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        latched = self._command.state in (State.FAULT, State.ESTOP)
+        if (held := self._stop_topic.held()) is not None:
+            response.success, response.message = False, held
+            return response
         self._goal = None
-        self._controller.reset()
+        latched = self._controller.reset()
         self._tick()
+        self._stop_file.forget()
         response.success = True
         response.message = "waiting for a new goal" if latched else "nothing to reset"
         return response
@@ -156,10 +161,10 @@ class InferenceNode(StoppableNode):
     def _emergency_stop(self, source: str) -> None:
         if self._command.state is State.ESTOP:  # several subscriptions hear the same message
             return
-        self.get_logger().error(f"emergency stop by {source}")
         self._publishing = True
         self._controller.emergency_stop()
         self._tick()
+        self.get_logger().error(f"emergency stop {source}")
 
     # What goes out
 
@@ -173,9 +178,8 @@ class InferenceNode(StoppableNode):
     def _tick(self) -> None:
         now = time.monotonic()
         interlocks = self._interlocks(now)
-        joint_state, self._joint_state = self._joint_state, None
         goal, self._goal = self._goal, None
-        command = self._controller.update(now, joint_state, goal, interlocks)
+        command = self._controller.update(now, self._robot.take(), goal, interlocks)
         self._publish(command)
         before, self._command = self._command, command
         if goal is not None:
@@ -191,16 +195,20 @@ class InferenceNode(StoppableNode):
 
     def _interlocks(self, now: float) -> list[str]:
         """Why the arm must not move, beside what the controller knows."""
-        found = [] if self._enabled else ["not enabled"]
+        found = [] if self._enabled else [self._disabled]
         rival = self._commands.rival
         if rival is not None:
-            found.append(f"another publisher commands {self._commands.topic}: {rival}")
+            found.append(rival)
             if self._publishing:  # it shall not go on by itself when the other one leaves
                 self._controller.forget_goal()
                 self._goal = None
         self._contested = rival is not None
-        if not self._commands.heard:
-            found.append(f"no controller listens to {self._commands.topic}")
+        if (rivals := self._robot.rivals(now)) is not None:
+            found.append(rivals)
+        if (silence := self._commands.silence(now)) is not None:
+            found.append(silence)
+        if (unheard := self._commands.unheard) is not None:
+            found.append(unheard)
             self._unheard = now
         elif now - self._started < _DISCOVERY or now - self._unheard < _REDISCOVERY:
             found.append("looking for other nodes")
@@ -220,6 +228,8 @@ class InferenceNode(StoppableNode):
 
     def _announce(self) -> None:
         command = self._command
+        if command.state is State.ESTOP:
+            self._stop_file.remember()
         self._states.publish(String(data=command.state.value))
         self._estopped.publish(Bool(data=command.state is State.ESTOP))
         self._diagnose()
@@ -236,8 +246,13 @@ class InferenceNode(StoppableNode):
             **self._controller.snapshot(),
             **self._timing.summary(),
             "enabled": self._enabled,
-            "stamp_age": self._stamp_age,
+            "stamp_age": self._robot.stamp_age,
+            "log lines dropped": outlet.dropped_lines(),
+            "emergency stop file": self._stop_file.failure or self._stop_file.unusable or self._stop_file.path,
         }
+        values["counters"]["states of other joints"] = self._robot.others
+        values["counters"]["emergency stop file failures"] = self._stop_file.failures
+        values["counters"]["watchdog silences"] = self._commands.silences
         now = self.get_clock().now().to_msg()
         self._diagnostics.publish(diagnose(self.get_name(), now, self._controller.policy, values))
 
@@ -245,12 +260,24 @@ class InferenceNode(StoppableNode):
         """See that the last command that the robot got is zero."""
         if self._publishing:
             self._commands.finish()
+        self._stop_file.close(_DISK)
+
+
+def _commands(node: InferenceNode, joints: int, config: InferenceConfig) -> VelocityCommands:
+    if not config.watchdog:
+        return VelocityCommands(node, joints)
+    try:
+        return WatchedCommands(node, joints, config.watchdog, config.watchdog_timeout)
+    except (ValueError, RuntimeError) as error:  # InvalidTopicNameException, RCLError
+        raise UserError(f"watchdog: must be the name of a node, got '{config.watchdog}': {brief(error)}") from None
 
 
 def _load(config: InferenceConfig) -> Policy:
     if not config.policy_path:
         raise UserError("policy_path: required, such as -p policy_path:=outputs/<run>/policy.pt")
-    policy = load_policy(config.policy_path, sha256=config.policy_sha256 or None)
+    if not config.policy_sha256:
+        raise UserError(f"policy_sha256: is empty; '{_ANY}' takes every file")
+    policy = load_policy(config.policy_path, sha256=None if config.policy_sha256 == _ANY else config.policy_sha256)
     metadata = policy.metadata
     if config.joints and (
         len(set(config.joints)) != len(config.joints) or not set(metadata.joints) <= set(config.joints)

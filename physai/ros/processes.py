@@ -2,6 +2,7 @@
 
 import contextlib
 import ctypes
+import os
 import signal
 import subprocess
 import sys
@@ -17,7 +18,7 @@ class NodeProcess:
 
     Args:
         module: Such as ``physai.ros.virtual_robot``.
-        log: Where its output goes.
+        log: Where its output goes; what it has to remember is kept beside.
         parameters: ROS parameters by name.
     """
 
@@ -29,7 +30,11 @@ class NodeProcess:
             command += ["-p", f"{name}:={str(value).lower() if isinstance(value, bool) else value}"]
         with open(log, "w") as output:
             self._process = subprocess.Popen(
-                command, stdout=output, stderr=subprocess.STDOUT, preexec_fn=_die_with_parent
+                command,
+                stdout=output,
+                stderr=subprocess.STDOUT,
+                env={**os.environ, "XDG_STATE_HOME": str(log.parent.absolute())},  # no other robot's emergency stop
+                preexec_fn=_die_with_parent,
             )
         self.pid = self._process.pid
 

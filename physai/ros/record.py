@@ -14,13 +14,13 @@ from pathlib import Path
 from typing import Any
 
 from rclpy.clock import Clock, ClockType
-from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.qos import QoSProfile
 from rclpy.subscription import Subscription
 from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
 
 from physai.deploy.parameters import Parameters, parameter
 from physai.errors import UserError
+from physai.ros import qos
 from physai.ros.bag import TYPES, Bag, recover
 from physai.ros.parameters import declare
 from physai.ros.run import StoppableNode, brief, run
@@ -112,13 +112,12 @@ class Recorder(StoppableNode):
             self.get_logger().warning(f"{topic} is not recorded: '{kind}' is not that of ROS 2 Jazzy")
             return None
         # Publishers of other kinds on the topic are no fault: they have subscriptions of their own.
-        silent = SubscriptionEventCallbacks(incompatible_qos=lambda _: None, use_default_callbacks=False)
         return self.create_subscription(
             message,
             topic,
             partial(self._take, topic, kind),
             QoSProfile(depth=_DEPTH, reliability=offered.reliability, durability=offered.durability),
-            event_callbacks=silent,
+            event_callbacks=qos.SILENT_SUBSCRIPTION,
             raw=True,
         )
 

@@ -70,6 +70,7 @@ class RobotLink:
             "/joint_states",
             self._take,  # type: ignore[arg-type]  # rclpy also takes callbacks with two arguments
             qos.SENSOR,
+            event_callbacks=qos.SILENT_SUBSCRIPTION,  # a log line on a stopped terminal would stop _watch, too
         )
         self._reset = None if reset_service is None else self._node.create_client(Trigger, reset_service)
         self._node.create_timer(silence / 2, self._watch, clock=Clock(clock_type=ClockType.STEADY_TIME))
@@ -123,10 +124,7 @@ class RobotLink:
     @property
     def obstacle(self) -> str | None:
         """Why commands must not be sent, or None."""
-        rival = self._commands.rival
-        if rival is not None:
-            return f"another publisher commands {self._commands.topic}: {rival}"
-        return None if self._commands.heard else f"no controller listens to {self._commands.topic}"
+        return self._commands.rival or self._commands.unheard
 
     def _no_state(self, seconds: float) -> str:
         why = f" that can be used: {self._refused}" if self._refused else ""

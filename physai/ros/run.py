@@ -1,13 +1,13 @@
 """How a node of physai starts, and how it ends: whatever happens, ``finish`` is called while ROS still works."""
 
 import argparse
-import contextlib
 import os
+import re
 import signal
 import sys
 import traceback
 from abc import abstractmethod
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Mapping
 from importlib.resources import files
 
 import rclpy
@@ -19,19 +19,15 @@ from rclpy.utilities import remove_ros_args
 
 from physai.deploy.parameters import Parameters
 from physai.errors import UserError
+from physai.ros import signals
+from physai.ros.outlet import outlets
 from physai.ros.parameters import help_text
 
-_SIGNALS = (
-    signal.SIGINT,
-    signal.SIGTERM,
-    signal.SIGHUP,
-    signal.SIGQUIT,
-    signal.SIGUSR1,
-    signal.SIGUSR2,
-    signal.SIGALRM,
-)
 # Jazzy's Fast DDS (2.14) reads the first, later ones the second.
 _PROFILES = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")
+_LAST_DOMAIN = 232  # that has numbers for its ports
+# ROS' log files: a disk that stands still would stop the node in the middle of a line. What the user says comes later.
+_NO_LOG_FILES = ["--ros-args", "--disable-external-lib-logs", "--"]
 
 
 class StoppableNode(Node):
@@ -62,6 +58,7 @@ def run(make_node: Callable[[], StoppableNode], module: str, about: str, kind: t
     Returns:
         The exit code: 0 after a signal or by its own wish, 1 after an exception, 2 if the user's input was wrong.
     """
+    caught = signals.catch()
     parser = argparse.ArgumentParser(
         prog=f"python -m {module}",
         usage="%(prog)s --ros-args [-p name:=value] [--params-file file.yaml] [-r topic:=/other/topic]",
@@ -73,62 +70,76 @@ def run(make_node: Callable[[], StoppableNode], module: str, about: str, kind: t
     except RuntimeError as error:  # RCLError: such as a file of parameters that does not exist
         return _refuse(brief(error))
     parser.parse_args(arguments)
-    prepare_middleware()
-    with _signals() as caught:
+    try:
+        prepare_middleware()
+    except UserError as error:
+        return _refuse(str(error))
+    with outlets():
         try:
-            rclpy.init(args=sys.argv, signal_handler_options=SignalHandlerOptions.NO)
+            rclpy.init(
+                args=[*sys.argv[:1], *_NO_LOG_FILES, *sys.argv[1:]], signal_handler_options=SignalHandlerOptions.NO
+            )
         except RuntimeError as error:  # RCLError
-            return _refuse(brief(error))
+            return _refuse(_of_ros(error))
         try:
             return _run(make_node, caught)
         finally:
             rclpy.try_shutdown()
+            signals.ignore()
 
 
 def prepare_middleware() -> None:
-    """Have Fast DDS find and miss nodes quickly, and use UDP alone (see fastdds.xml); the user's own settings stay."""
+    """Have Fast DDS find and miss nodes quickly, and use UDP alone (see fastdds.xml); the user's own settings stay.
+
+    Raises:
+        UserError: If ROS_DOMAIN_ID is none.
+    """
+    domain = os.environ.get("ROS_DOMAIN_ID") or "0"
+    if not re.fullmatch("0|[1-9][0-9]{0,2}", domain, re.ASCII) or int(domain) > _LAST_DOMAIN:
+        raise UserError(f"ROS_DOMAIN_ID: must be a whole number from 0 to {_LAST_DOMAIN}, got {domain!r}")
     if not any(name in os.environ for name in _PROFILES):
         os.environ.update(dict.fromkeys(_PROFILES, str(files("physai.ros") / "fastdds.xml")))
         os.environ.setdefault("FASTDDS_BUILTIN_TRANSPORTS", "UDPv4")  # beyond LOCALHOST, where ROS chooses for itself
 
 
-def _run(make_node: Callable[[], StoppableNode], caught: list[int]) -> int:
+def _run(make_node: Callable[[], StoppableNode], caught: Mapping[int, object]) -> int:
     try:
         node = make_node()
     except (UserError, ParameterException) as error:  # such as a use_sim_time that is no bool
         return _refuse(str(error))
+    except RuntimeError as error:  # RCLError
+        return _refuse(_of_ros(error))
+    except Exception:  # said here: nothing can be said any more when this function has returned
+        traceback.print_exc()
+        return 1
     executor = SingleThreadedExecutor()
     executor.add_node(node)
-    log = node.get_logger()
+    code, last_words = 0, ""
     try:
         while not node.stopped and not caught:
             executor.spin_once(timeout_sec=0.1)
-        log.info(f"{signal.Signals(caught[0]).name} ends this node" if caught else "this node ends")
-        return 0
     except UserError as error:
-        log.fatal(str(error))
-        return 2
+        code, last_words = 2, str(error)
     except Exception as error:
-        log.fatal(f"{type(error).__name__} ends this node: {error}\n{traceback.format_exc()}")
-        return 1
+        code, last_words = 1, f"{type(error).__name__} ends this node: {error}\n{traceback.format_exc()}"
     finally:
-        try:
-            executor.shutdown(timeout_sec=1.0)
-        finally:
-            node.finish()
-            node.destroy_node()
+        node.finish()  # before anything else
+    log = node.get_logger()
+    if last_words:
+        log.fatal(last_words)
+    else:
+        log.info(f"{signal.Signals(next(iter(caught))).name} ends this node" if caught else "this node ends")
+    executor.shutdown(timeout_sec=1.0)
+    node.destroy_node()
+    return code
 
 
-@contextlib.contextmanager
-def _signals() -> Iterator[list[int]]:
-    """Note signals instead of dying of them."""
-    caught: list[int] = []
-    before = {number: signal.signal(number, lambda number, _: caught.append(number)) for number in _SIGNALS}
-    try:
-        yield caught
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+def _of_ros(error: Exception) -> str:
+    """What ROS says, and what it does not say where its security is on."""
+    if os.environ.get("ROS_SECURITY_ENABLE") != "true":
+        return brief(error)
+    needs = "ROS_SECURITY_KEYSTORE, keys of this node, and a Fast DDS built with security, which PyPI's is not"
+    return f"ROS_SECURITY_ENABLE=true needs {needs}: {brief(error)}"
 
 
 def brief(error: Exception) -> str:

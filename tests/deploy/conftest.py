@@ -10,6 +10,8 @@ import pytest
 
 from physai.deploy import Policy, load_policy
 
+pytest.register_assert_rewrite("tests.deploy.world")
+
 
 @pytest.fixture(scope="session")
 def policy(exported_run) -> Policy:

@@ -2,6 +2,7 @@
 
 import math
 from collections import deque
+from itertools import count
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ import torch
 
 from physai.config import compose, validate
 from physai.deploy import Controller, ControllerConfig, Goal, JointState, State
+from physai.deploy.following import Following
 from physai.physics import ParameterLayout, RandomizationConfig
 from physai.physics.pybullet import PyBulletPhysics
 from physai.robots import RobotSpec
@@ -165,6 +167,26 @@ def test_an_arm_that_follows_late_and_noisily_is_no_fault(policy, speed, delay):
         angle, radius = noise.uniform(-3.1, 3.1), noise.uniform(0.31, 0.52)
         commands = arm.run(4.0, Goal([radius * math.cos(angle), radius * math.sin(angle)], "base"))
         assert {command.state for command in commands} <= {State.ACTIVE, State.REACHED}
+
+
+def test_an_arm_that_follows_is_no_fault_though_every_second_state_is_refused(policy):
+    arm, states = Arm(policy), count()
+    arm.show = lambda velocity, **values: values | {"velocity": velocity if next(states) % 2 else (math.nan, 0.0)}
+    assert {command.state for command in arm.run(4.0, FAR_GOAL)[1:]} == {State.ACTIVE}
+    assert arm.counters["states rejected: velocity missing"] == 100
+
+
+@pytest.mark.parametrize("every", [2, 3, 4])
+@pytest.mark.parametrize("age", [0.0, 0.01])
+def test_states_that_come_seldom_and_not_on_time_are_measured_at_their_own_time(policy, every, age):
+    following = Following(policy.metadata, ControllerConfig(following_error=0.05, velocity_error=0.01))
+    speed = np.array([2.0, -0.5])
+    for tick in range(100):
+        now = tick * PERIOD
+        following.commanded(now, speed)
+        if tick % every == every - 1:
+            motion = np.concatenate([speed * (now - age), speed])
+            assert following.heard(now - age, motion) is None
 
 
 def test_what_happens_to_an_arm_that_is_not_driven_is_no_fault(policy):

@@ -91,6 +91,14 @@ def test_another_hash_is_refused(content, path, change):
     assert "its SHA-256 is" in refusal(path, sha256=change(hashlib.sha256(content).hexdigest()))
 
 
+@pytest.mark.parametrize(
+    "wrong", [5, b"0" * 64, ["0" * 64], True, np.zeros(2), list(range(999))], ids=lambda v: type(v).__name__
+)
+def test_a_hash_that_is_no_text_is_refused_in_one_line(content, path, wrong):
+    path.write_bytes(content)
+    assert refusal(path, sha256=wrong).startswith("sha256 must be text, in hexadecimal, not ")
+
+
 def test_the_hash_beside_is_used_unless_another_is_given(content, path):
     path.write_bytes(content)
     digest, beside = hashlib.sha256(content).hexdigest(), path.with_name("policy.pt.sha256")

@@ -81,15 +81,16 @@ def domain() -> Iterator[int]:
 
 
 @pytest.fixture
-def start(domain: int) -> Iterator[Callable[..., Process]]:
+def start(domain: int, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[..., Process]]:
     """Start nodes of physai: ``start("virtual_robot", rate_hz=100)``; they are gone after the test."""
     processes: list[Process] = []
+    own = {"XDG_STATE_HOME": str(tmp_path_factory.mktemp("state"))}  # no other test's emergency stop
 
     def start(module: str, *args: str, env: dict[str, str] | None = None, **parameters: Any) -> Process:
-        processes.append(Process(node_command(module, *args, **parameters), domain, env))
+        processes.append(Process(node_command(module, *args, **parameters), domain, own | (env or {})))
         return processes[-1]
 
-    start.run = lambda command, env=None: processes.append(Process(command, domain, env)) or processes[-1]
+    start.run = lambda command, env=None: processes.append(Process(command, domain, own | (env or {}))) or processes[-1]
     yield start
     with ThreadPoolExecutor() as pool:
         list(pool.map(Process.end, processes))

@@ -4,6 +4,7 @@ Run as a program, it forks a process for each line of JSON that it reads, and te
 it, and it ends with its input.
 """
 
+import contextlib
 import ctypes
 import importlib
 import json
@@ -66,13 +67,23 @@ _forges: list[Forge] = []
 class ForgedProcess(Process):
     """A node of a forge."""
 
-    def __init__(self, module: str, arguments: Sequence[str], domain: int) -> None:
+    def __init__(
+        self, module: str, arguments: Sequence[str], domain: int, state: Path | None, output: Path | None
+    ) -> None:
         if not _forges:
             _forges.append(Forge())
         self._forge = _forges[0]
-        self._log = Path(tempfile.mkstemp(prefix="physai-test-node-", suffix=".log")[1])
+        self._folder = tempfile.TemporaryDirectory(prefix="physai-test-node-")
+        self._log = Path(self._folder.name) / "log"
+        self._log.touch()
         self._last: list[str] | None = None
-        order = {"module": module, "arguments": list(map(str, arguments)), "domain": domain, "log": str(self._log)}
+        order = {
+            "module": module,
+            "arguments": list(map(str, arguments)),
+            "domain": domain,
+            "log": str(output or self._log),
+            "state": str(state or self._folder.name),  # no other test's emergency stop
+        }
         self._pid = self._forge.fork(order)
 
     @property
@@ -88,7 +99,8 @@ class ForgedProcess(Process):
 
     def signal(self, number: int) -> None:
         if self.poll() is None:
-            os.kill(self._pid, number)
+            with contextlib.suppress(ProcessLookupError):  # it has just ended
+                os.kill(self._pid, number)
 
     def wait(self, timeout: float = 20.0) -> int:
         wait_for(lambda: self.poll() is not None, timeout, f"an end of\n{self.output}")
@@ -103,13 +115,24 @@ class ForgedProcess(Process):
             self.signal(signal.SIGKILL)
             self.wait(10)
         self._last = self.lines
-        self._log.unlink(missing_ok=True)
+        self._folder.cleanup()
 
 
-def forged(module: str, domain: int, *args: str, **parameters: Any) -> ForgedProcess:
-    """Start a node: ``forged("inference_node", domain, policy_path=path)``."""
+def forged(
+    module: str, domain: int, *args: str, state: Path | None = None, output: Path | None = None, **parameters: Any
+) -> ForgedProcess:
+    """Start a node: ``forged("inference_node", domain, policy_path=path)``.
+
+    Args:
+        module: Which one.
+        domain: Its ROS domain.
+        args: Behind --ros-args.
+        state: Where it keeps what it remembers; None for nowhere else.
+        output: Where its output goes, such as a terminal; None for where it is read.
+        parameters: By name.
+    """
     name = module if "." in module else f"physai.ros.{module}"
-    return ForgedProcess(name, node_command(module, *args, **parameters)[3:], domain)
+    return ForgedProcess(name, node_command(module, *args, **parameters)[3:], domain, state, output)
 
 
 def close_forges() -> None:
@@ -138,6 +161,7 @@ def _become(order: dict[str, Any]) -> None:
     for number, target in ((os.open(os.devnull, os.O_RDONLY), 0), (log, 1), (log, 2)):
         os.dup2(number, target)
     os.environ["ROS_DOMAIN_ID"] = str(order["domain"])
+    os.environ["XDG_STATE_HOME"] = order["state"]
     sys.argv = [order["module"], *order["arguments"]]
     sys.exit(importlib.import_module(order["module"]).main())
 

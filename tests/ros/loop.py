@@ -61,8 +61,12 @@ class Arm:
         message.header.stamp.sec, message.header.stamp.nanosec = divmod(nanoseconds, 10**9)
         changed = self.change(message)
         if changed is not None:
-            self.sent.append(now)
-            self._publisher.publish(changed)
+            self.publish(changed)
+
+    def publish(self, message: JointState) -> None:
+        """Send it."""
+        self.sent.append(time.monotonic())
+        self._publisher.publish(message)
 
     def leave(self) -> None:
         """Neither tell nor hear anything any more."""
@@ -101,7 +105,7 @@ class Loop:
         self.peer.call("/inference_node/estop")
         self.arm.go_home()
         since = time.monotonic()
-        self.peer.call("/inference_node/reset")
+        wait_for(lambda: self.peer.call("/inference_node/reset").success, what="a reset")
         self.peer.wait_state("waiting", after=since)
         wait_for(lambda: self.peer.enable().success, what="permission to move")
 
@@ -125,14 +129,16 @@ def closed_loop(
     rate: float = 100.0,
     peer: Peer | None = None,
     module: str = "inference_node",
+    state: Path | None = None,
+    output: Path | None = None,
     **parameters: Any,
 ) -> Iterator[Loop]:
-    """Run the inference node with an arm, in a domain of its own or in that of a peer."""
+    """Run the inference node with an arm, in a domain of its own or in that of a peer; see :func:`forged`."""
     with contextlib.ExitStack() as stack:
         if peer is None:
             peer = Peer(stack.enter_context(free_domain()))
             stack.callback(peer.close)
         parameters = {"policy_path": policy_path, "autostart": True, **parameters}
-        node = forged(module, peer.domain, *args, **parameters)
+        node = forged(module, peer.domain, *args, state=state, output=output, **parameters)
         stack.callback(node.end)
         yield Loop(peer, node, profile, rate)

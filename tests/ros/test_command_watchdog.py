@@ -6,7 +6,7 @@ import time
 from array import array
 
 import pytest
-from std_msgs.msg import Float64MultiArray
+from std_msgs.msg import Empty, Float64MultiArray
 
 from tests.ros.forge import forged
 from tests.ros.peer import TOPIC, Peer, free_domain, wait_for
@@ -60,7 +60,8 @@ def test_nonsense_becomes_zeros(watchdog, nonsense):
 
 def test_another_commander_of_the_controller_stops_the_arm(watchdog):
     passes(watchdog, 0.1, 0.2)
-    rival = watchdog.node.create_publisher(Float64MultiArray, TOPIC, 1)
+    other = Peer(watchdog.domain)
+    other.publisher(Float64MultiArray, TOPIC, 1)
 
     def stopped() -> bool:
         send(watchdog, 0.1, 0.2)
@@ -70,7 +71,7 @@ def test_another_commander_of_the_controller_stops_the_arm(watchdog):
     wait_for(stopped, what="zeros while another one commands")
     watchdog.process.says(f"zero velocity: another publisher commands {TOPIC}: peer")
     assert not watchdog.call("/command_watchdog/reset").success
-    watchdog.node.destroy_publisher(rival)
+    other.close()
     since = time.monotonic()
     while time.monotonic() < since + 0.5:  # it does not go on by itself
         send(watchdog, 0.1, 0.2)
@@ -78,6 +79,31 @@ def test_another_commander_of_the_controller_stops_the_arm(watchdog):
     watchdog.all_zeros(after=since, commands=20)
     wait_for(lambda: watchdog.call("/command_watchdog/reset").success, what="a reset after the other one has left")
     passes(watchdog, 0.1, 0.2)
+
+
+def test_who_commands_the_watchdog_may_stand_by_to_command_the_controller(watchdog):
+    standby = watchdog.node.create_publisher(Float64MultiArray, TOPIC, 1)
+    passes(watchdog, 0.1, 0.2)
+    for _ in range(20):
+        send(watchdog, 0.1, 0.2)
+        time.sleep(0.02)
+    assert watchdog.commands[-1][1] == [0.1, 0.2]
+    watchdog.node.destroy_publisher(standby)
+    assert watchdog.call("/command_watchdog/reset").success
+
+
+def test_its_heart_beats_as_often_as_it_looks_and_not_while_it_stands_still(watchdog):
+    beats = []
+    watchdog.listen(Empty, "/command_watchdog/heartbeat", beats, 10)
+    wait_for(lambda: len(beats) > 50)
+    assert 0.8 < beats[50][0] - beats[0][0] < 1.3
+    watchdog.process.signal(signal.SIGSTOP)
+    time.sleep(0.05)
+    count = len(beats)
+    time.sleep(0.2)
+    assert len(beats) == count
+    watchdog.process.signal(signal.SIGCONT)
+    wait_for(lambda: len(beats) > count + 5)
 
 
 def test_what_waited_while_the_watchdog_stood_still_is_not_passed_on(watchdog):

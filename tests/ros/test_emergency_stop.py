@@ -8,7 +8,7 @@ from std_msgs.msg import Bool, String
 
 from physai.ros import qos
 from tests.ros.loop import FAR, closed_loop
-from tests.ros.peer import wait_for
+from tests.ros.peer import Peer, wait_for
 
 WITHIN = 0.02 + 0.03  # s: a period, and what the transport and a busy machine may take
 PROFILES = {
@@ -27,6 +27,14 @@ def loop(policy_path):
         for profile in PROFILES.values():  # early enough to be known when they matter
             loop.peer.publisher(Bool, "/emergency_stop", profile)
         yield loop
+
+
+@pytest.fixture(autouse=True)
+def _released(request):
+    """What a test has latched does not hold the stop of the next one."""
+    yield
+    if "loop" in request.fixturenames:
+        request.getfixturevalue("loop").peer.publisher(Bool, "/emergency_stop", PROFILES["latched"]).publish(Bool())
 
 
 def stays_stopped(loop, since: float) -> None:
@@ -109,10 +117,47 @@ def test_one_that_was_pressed_before_the_node_started_counts(policy_path, peer):
     with closed_loop(policy_path, peer=peer, goal="[-0.3, -0.2]") as loop:
         loop.peer.wait_state("estop")
         loop.peer.all_zeros(after=0.0, commands=30)
-        assert loop.peer.call("/inference_node/reset").success
+        answer = loop.peer.call("/inference_node/reset")
+        assert (answer.success, answer.message) == (False, "/emergency_stop is still true, latched: peer")
+        loop.peer.publish("/emergency_stop", Bool(data=False), PROFILES["latched"])
+        wait_for(lambda: loop.peer.call("/inference_node/reset").success, what="a reset")
         loop.peer.wait_state("waiting")
         loop.peer.send_goal(*FAR)
         loop.peer.moved()
+
+
+def test_a_reset_is_refused_while_one_of_two_latched_stops_is_still_pressed(loop):
+    other = Peer(loop.peer.domain)
+    try:
+        loop.start()
+        ours, theirs = (peer.publisher(Bool, "/emergency_stop", PROFILES["latched"]) for peer in (loop.peer, other))
+        wait_for(lambda: theirs.get_subscription_count() >= 3)
+        ours.publish(Bool(data=True))
+        loop.peer.wait_state("estop")
+        theirs.publish(Bool(data=True))
+        theirs.publish(Bool(data=False))
+        time.sleep(0.1)
+        since = time.monotonic()
+        while time.monotonic() < since + 1.2:
+            answer = loop.peer.call("/inference_node/reset")
+            assert not answer.success
+            assert "/emergency_stop is still true" in answer.message
+            time.sleep(0.1)
+        ours.publish(Bool(data=False))
+        wait_for(lambda: loop.peer.call("/inference_node/reset").success, 5.0, "a reset once both are released")
+        theirs.publish(Bool(data=True))
+        loop.peer.wait_state("estop")
+        assert not loop.peer.call("/inference_node/reset").success
+    finally:
+        other.close()
+    wait_for(lambda: loop.peer.call("/inference_node/reset").success, 10.0, "a reset once the pressed one has left")
+
+
+def test_a_true_that_is_not_latched_does_not_hold_the_stop(loop):
+    loop.start()
+    loop.peer.publish("/emergency_stop", Bool(data=True), PROFILES["reliable"])
+    loop.peer.wait_state("estop")
+    assert loop.peer.call("/inference_node/reset").success
 
 
 def test_it_is_taken_without_a_robot_and_without_being_enabled(policy_path):

@@ -1,15 +1,20 @@
 """Joint states as robots send them, good and bad: what the node makes of each."""
 
+import contextlib
 import itertools
 import math
+import re
+import threading
 import time
 
 import pytest
+from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from sensor_msgs.msg import JointState
 
 from physai.ros import qos
-from tests.ros.loop import Arm, closed_loop
+from tests.ros.loop import FAR, Arm, closed_loop
+from tests.ros.peer import wait_for
 
 WITHIN = 0.15  # s
 
@@ -91,10 +96,11 @@ BAD = {
     "nothing in it": lambda message: JointState(header=message.header),
 }
 COUNTED = {
-    "infinite position": "position not finite",
-    "one joint alone": "joint missing",
-    "velocity NaN": "velocity missing",
-    "nothing in it": "joint missing",
+    "infinite position": "states rejected: position not finite",
+    "joint missing": "holds: state old",
+    "one joint alone": "holds: state old",
+    "velocity NaN": "states rejected: velocity missing",
+    "nothing in it": "states of other joints",
 }
 
 
@@ -109,8 +115,9 @@ def test_the_arm_moves_on(loop, change):
 
 @pytest.mark.parametrize("name", BAD)
 def test_the_arm_stops_counts_and_goes_on_by_itself(loop, name):
+    loop.peer.set_parameters("/inference_node", resume_timeout=10.0)  # a busy machine may take its time
     loop.start()
-    counted = f"count: states rejected: {COUNTED.get(name, name)}"
+    counted = f"count: {COUNTED.get(name, f'states rejected: {name}')}"
     before = int(loop.diagnosis(after=0.0)[2].get(counted, 0))
     REPEATED.clear()
     since = loop.arm.sent[-1]
@@ -190,3 +197,119 @@ def test_of_an_arm_far_beyond_its_limit_are_a_fault_until_it_is_back_and_reset(l
     loop.peer.all_zeros(after=since, commands=40)
     assert loop.peer.states[-1][1] == "fault"
     loop.start()
+
+
+# In parts, beside those of others, and by two publishers.
+
+
+@contextlib.contextmanager
+def gripper(loop, rate):
+    """A broadcaster with messages of its own, of joints that are not the arm's."""
+    publisher = loop.peer.node.create_publisher(JointState, "/joint_states", 10)
+    message, leave = JointState(name=["finger1", "finger2"], position=[0.0, 0.0]), threading.Event()
+
+    def run():
+        due = time.monotonic()
+        while not leave.wait(max(0.0, (due := due + 1 / rate) - time.monotonic())):
+            message.header.stamp.sec, message.header.stamp.nanosec = divmod(time.time_ns(), 10**9)
+            publisher.publish(message)
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    try:
+        yield
+    finally:
+        leave.set()
+        thread.join()
+        loop.peer.node.destroy_publisher(publisher)
+
+
+@pytest.mark.parametrize("rate", [50, 200])  # at 1,000 Hz, this process would be busy with them, too
+def test_of_an_arm_beside_a_gripper_move_it_as_if_it_were_alone(loop, rate):
+    with gripper(loop, rate):
+        since = loop.start()
+        wait_for(lambda: time.monotonic() > since + 2.0)
+        commands = [any(velocity) for at, velocity in list(loop.peer.commands) if since < at < since + 2.0]
+        counters = loop.diagnosis()[2]
+    assert sum(commands) >= 0.95 * len(commands) > 80
+    assert int(counters["count: states of other joints"]) > 1.5 * rate
+
+
+def test_with_every_joint_in_a_message_of_its_own_lead_to_the_goals(policy_path):
+    def apart(arm):
+        def change(message):
+            for place, joint in enumerate(arm.NAMES):
+                part = JointState(header=message.header, name=[joint])
+                part.position, part.velocity = message.position[place : place + 1], message.velocity[place : place + 1]
+                arm.publish(part)
+
+        return change
+
+    with closed_loop(policy_path, max_velocity=1.0, limit_margin=0.2) as loop:
+        loop.arm.change = apart(loop.arm)
+        loop.peer.wait_state("waiting")
+        for angle in (0.3, 2.0, -1.5, -2.8):
+            since = time.monotonic()
+            loop.peer.send_goal(0.4 * math.cos(angle), 0.4 * math.sin(angle))
+            loop.peer.wait_state("active", after=since)
+            loop.peer.wait_state("reached", after=since)
+        assert "count: holds: state old" not in loop.diagnosis()[2]
+
+
+def test_of_two_publishers_that_claim_a_joint_are_a_reason_to_wait_that_names_both(policy_path):
+    with closed_loop(policy_path, goal=list(FAR)) as loop:
+        loop.peer.moved()
+        impostor = Node("impostor", context=loop.peer.node.context)
+        publisher = impostor.create_publisher(JointState, "/joint_states", 10)
+        change = loop.arm.change
+        loop.arm.change = lambda message: publisher.publish(message) or message
+        since = time.monotonic()
+        wait_for(lambda: "claim 'joint" in loop.diagnosis()[1], 5.0, loop.diagnosis()[1])
+        assert re.search(r"two publishers of /joint_states claim 'joint[12]': impostor, peer", loop.diagnosis()[1])
+        loop.peer.all_zeros(after=since + WITHIN, commands=20)
+        loop.arm.change = change
+        impostor.destroy_node()
+        loop.peer.wait_state("waiting")
+        wait_for(lambda: "no goal yet" in loop.diagnosis()[1] and "claim" not in loop.diagnosis()[1], 10.0)
+        loop.peer.all_zeros(after=since + WITHIN, commands=20)
+
+
+@pytest.mark.parametrize("as_another", [False, True], ids=["by the same publisher", "by another"])
+def test_that_come_again_after_three_seconds_move_nothing_before_a_new_goal(loop, as_another):
+    loop.peer.set_parameters("/inference_node", resume_timeout=1.0)
+    loop.start()
+    loop.arm.pause()
+    time.sleep(3.0)
+    if as_another:
+        loop.arm.leave()
+        loop.arm = Arm(loop.peer)
+    loop.arm.go_home()
+    loop.arm.position = [1.0, 1.0]
+    since = time.monotonic()
+    loop.peer.wait_state("waiting", after=since)
+    loop.peer.all_zeros(after=since, commands=30)
+    assert "no goal yet" in loop.diagnosis()[1]
+    assert any("goal forgotten: the robot was silent for 3" in line for line in loop.node.lines)
+    loop.start_from_here()
+
+
+def test_that_come_again_after_half_a_second_move_the_arm_on(loop):
+    loop.peer.set_parameters("/inference_node", resume_timeout=1.0)
+    loop.start()
+    loop.arm.pause()
+    time.sleep(0.5)
+    loop.arm.go_home()
+    loop.peer.moved(after=time.monotonic())
+
+
+def test_by_another_publisher_than_before_need_a_new_goal_however_soon_they_come(loop):
+    loop.start()
+    position = loop.arm.position
+    loop.arm.leave()
+    loop.arm = Arm(loop.peer)
+    loop.arm.position = position
+    since = time.monotonic()
+    loop.peer.wait_state("waiting", after=since)
+    loop.peer.all_zeros(after=loop.peer.states[-1][0], commands=20)
+    assert any("is told by another source than before" in line for line in loop.node.lines)
+    loop.start_from_here()

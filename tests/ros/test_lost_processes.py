@@ -85,7 +85,7 @@ def test_after_a_killed_node_a_faithful_robot_moves_on_and_on(driven, peer):
 @pytest.mark.parametrize("timeout", [0.1, 0.3])
 def test_a_watchdog_between_stops_the_arm_of_a_killed_node(driven, start, peer, timeout):
     start("command_watchdog", timeout=timeout)
-    _, node = driven("-r", "/joint_velocity_controller/commands:=/command_watchdog/commands")
+    _, node = driven(watchdog="/command_watchdog")
     node.signal(signal.SIGKILL)
     since = time.monotonic()
     took = peer.first_zeros(after=since)

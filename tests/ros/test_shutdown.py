@@ -3,6 +3,7 @@
 import contextlib
 import signal
 import time
+from pathlib import Path
 
 import pytest
 
@@ -67,3 +68,24 @@ def test_a_node_that_never_had_a_say_ends_without_a_word(policy_path):
         assert loop.node.wait() == 0
         loop.peer.silent()
         assert loop.peer.commands == []
+
+
+def test_a_storm_of_signals_ends_it_as_one_does(policy_path):
+    with closed_loop(policy_path, goal=GOAL) as loop:
+        loop.peer.moved()
+        while loop.node.poll() is None:
+            for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1, signal.SIGTSTP):
+                loop.node.signal(number)
+            time.sleep(0.0002)
+        assert loop.node.wait() == 0, loop.node.output
+        leaves_the_arm_standing(loop.peer)
+        assert "Traceback" not in loop.node.output
+
+
+@pytest.mark.parametrize("library", ["librcl.so", "libtorch_cpu.so", "librmw_fastrtps_cpp.so"])
+def test_a_signal_before_it_is_up_ends_it_without_a_traceback(start, policy_path, library):
+    process = start("inference_node", policy_path=policy_path)
+    wait_for(lambda: library in Path(f"/proc/{process.pid}/maps").read_text(), what=library)
+    process.signal(signal.SIGINT)
+    assert process.wait() in (0, -signal.SIGINT)
+    assert "Traceback" not in process.output

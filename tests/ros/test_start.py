@@ -1,10 +1,13 @@
 """What the nodes refuse at their start: one line that says why, exit code 2, and not a word to the robot."""
 
 import shutil
+import sys
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
+from physai.errors import UserError
+from physai.ros.robot_link import RobotLink
 from tests.ros.forge import forged
 from tests.ros.loop import closed_loop
 from tests.ros.peer import wait_for
@@ -63,6 +66,8 @@ def test_bad_policy_files_are_refused(files, refused, policy_path):
             ({"policy_path": files / "folder.pt"}, "folder.pt: "),
             ({"policy_path": files / "beside.pt"}, "not that of beside.pt.sha256, 0000000000000000..."),
             ({"policy_path": policy_path, "policy_sha256": "'" + "1" * 64 + "'"}, "not the expected one, 1111111111"),
+            ({"policy_path": policy_path, "policy_sha256": '""'}, "error: policy_sha256: is empty; 'any' takes every"),
+            ({"policy_path": policy_path, "watchdog": "no name"}, "error: watchdog: must be the name of a node, got"),
             ({"policy_path": policy_path, "joints": "[a, b]"}, "joints: ['a', 'b'] must be distinct and hold all"),
             ({"policy_path": policy_path, "joints": "[joint1, joint1]"}, "joints: ['joint1', 'joint1'] must be dist"),
         ]
@@ -112,3 +117,25 @@ def test_whole_numbers_are_taken_for_floats_and_misspelt_names_warn_with_the_nea
             return 99 / (times[-1] - times[0])
 
         wait_for(lambda: 95 < rate() < 105, 10.0, "100 commands a second")  # when this process is not busy itself
+
+
+@pytest.mark.parametrize(
+    ("module", "domain"),
+    [
+        *(("command_watchdog", domain) for domain in ("abc", "-1", "233", "7x")),
+        *((module, "999") for module in ("inference_node", "virtual_robot", "record", "demo")),
+    ],
+)
+def test_a_domain_that_there_is_not_is_refused_in_one_line(start, policy_path, module, domain):
+    command = [sys.executable, "-m", f"physai.ros.{module}"]
+    path = [f"policy_path={policy_path}"] if module == "demo" else []
+    process = start.run(command + path, {"ROS_DOMAIN_ID": domain})
+    assert process.wait(60) == 2
+    assert process.lines[-1] == f"error: ROS_DOMAIN_ID: must be a whole number from 0 to 232, got '{domain}'"
+    assert "Traceback" not in process.output
+
+
+def test_an_environment_refuses_it_too(monkeypatch):
+    monkeypatch.setenv("ROS_DOMAIN_ID", "999")
+    with pytest.raises(UserError, match="ROS_DOMAIN_ID: must be a whole number from 0 to 232, got '999'"):
+        RobotLink(["joint1"], 0.1, None, [])

@@ -6,8 +6,7 @@ from launch.actions import DeclareLaunchArgument, OpaqueFunction
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
-COMMANDS = "/joint_velocity_controller/commands"
-SAFE_COMMANDS = "/command_watchdog/commands"
+WATCHDOG = "/command_watchdog"
 
 
 def generate_launch_description() -> LaunchDescription:
@@ -40,12 +39,12 @@ def make_nodes(context: LaunchContext) -> list[Node]:
         LaunchConfiguration(name).perform(context)
         for name in ("policy_path", "params_file", "use_virtual_robot", "use_watchdog")
     )
+    watchdog = {"watchdog": WATCHDOG} if use_watchdog == "true" else {}
     node = {"package": "physai", "output": "screen"}
     nodes = [
         Node(
             executable="inference_node",
-            parameters=[params_file, {"policy_path": policy_path}],
-            remappings=[(COMMANDS, SAFE_COMMANDS)] if use_watchdog == "true" else [],
+            parameters=[params_file, {"policy_path": policy_path} | watchdog],
             **node,
         )
     ]

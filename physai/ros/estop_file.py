@@ -1,0 +1,137 @@
+"""An emergency stop outlives the node: a file that is there says so."""
+
+import os
+import threading
+import time
+from pathlib import Path
+
+_CREATED = 0.01  # s that a stop may wait for its file, behind the zeros
+_RETRY = 1.0  # s
+
+
+class EmergencyStopFile:
+    """Remembers, for one node of one ROS domain, whether it is in an emergency stop.
+
+    The file's being there is all that it says, so that it is never half written; what is in it is for people. A thread
+    of its own makes and removes it, and syncs it and its folder: no disk keeps anybody waiting who has an arm to stop.
+
+    Args:
+        node: Full name of the node.
+        domain: Its ROS domain.
+
+    Attributes:
+        path: The file.
+        stopped: Whether it was there at the start.
+        unusable: Why no stop can be remembered, as seen at the start; empty if it can.
+        failure: Why the last change is not on the disk; empty if it is.
+        failures: How often the disk has refused.
+    """
+
+    def __init__(self, node: str, domain: int) -> None:
+        self.stopped, self.unusable, self.failure, self.failures = False, "", "", 0
+        self.path = Path(os.devnull)
+        try:
+            self.path = _folder() / f"domain_{domain}{node.replace('/', '.')}.estop"
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            self.stopped = os.path.lexists(self.path)
+            _try(self.path.with_name(f"{self.path.name}.{os.getpid()}"))
+        except (OSError, RuntimeError) as error:  # RuntimeError: who has no home
+            self.unusable = _why(error, self.path)
+        self._wanted = self._there = self._synced = self.stopped
+        self._changed = threading.Condition()
+        self._ended = False
+        self._thread = threading.Thread(target=self._work, name="estop_file", daemon=True)
+        self._thread.start()
+
+    def remember(self) -> None:
+        """Have the file made; waits a moment for it, so that who hears of the stop next can rely on it."""
+        with self._changed:
+            if self._wanted:
+                return
+            self._wanted = True
+            self._changed.notify_all()
+            self._changed.wait_for(lambda: self._there, _CREATED)
+
+    def forget(self) -> None:
+        """Have the file removed."""
+        with self._changed:
+            self._wanted = False
+            self._changed.notify_all()
+
+    def close(self, timeout: float) -> None:
+        """Wait for the disk, at most for so long, s."""
+        with self._changed:
+            self._ended = True
+            self._changed.notify_all()
+        self._thread.join(timeout)
+
+    def _work(self) -> None:
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._wanted != self._synced or self._ended)
+                wanted = self._wanted
+                if wanted == self._synced:
+                    return
+            try:
+                self._write(wanted)
+                self._synced, self.failure = wanted, ""
+            except OSError as error:
+                self.failure = _why(error, self.path)
+                self.failures += 1
+                with self._changed:
+                    if self._ended:
+                        return
+                    self._changed.wait_for(lambda: self._ended, _RETRY)
+
+    def _write(self, stopped: bool) -> None:
+        if stopped:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            with open(self.path, "w") as file:
+                self._notice(True)
+                file.write(f"emergency stop at {time.strftime('%Y-%m-%d %H:%M:%S')}, until ~/reset\n")
+                file.flush()
+                os.fsync(file.fileno())
+        else:
+            self.path.unlink(missing_ok=True)
+            self._notice(False)
+        _sync(self.path.parent)
+
+    def _notice(self, there: bool) -> None:
+        with self._changed:
+            self._there = there
+            self._changed.notify_all()
+
+
+def _folder() -> Path:
+    """Where programs of this user keep what they have to remember (XDG Base Directory Specification)."""
+    given = Path(os.environ.get("XDG_STATE_HOME", ""))
+    return (given if given.is_absolute() else Path.home() / ".local" / "state") / "physai"
+
+
+def _try(path: Path) -> None:
+    """See that a file can be written here.
+
+    Raises:
+        OSError: If not.
+    """
+    try:
+        with open(path, "w") as file:
+            file.write("whether an emergency stop could be remembered\n")
+            file.flush()
+            os.fsync(file.fileno())
+    finally:
+        path.unlink(missing_ok=True)
+
+
+def _sync(folder: Path) -> None:
+    opened = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(opened)
+    finally:
+        os.close(opened)
+
+
+def _why(error: Exception, path: Path) -> str:
+    if not isinstance(error, OSError):
+        return str(error)
+    return f"{error.filename or path}: {error.strerror}"

@@ -1,0 +1,116 @@
+"""Joint states as robots publish them: in one message or in parts, beside those of other joints, by one node or two."""
+
+import time
+from collections import defaultdict, deque
+from collections.abc import Callable, Sequence
+
+from rclpy.node import Node
+from sensor_msgs.msg import JointState as JointStateMessage
+
+from physai.deploy import JointState
+from physai.ros import qos
+
+TOPIC = "/joint_states"
+_RIVALRY = 3.0  # s; two publishers are rivals for so long after they have taken turns
+
+
+class JointStates:
+    """Keeps the newest message of each part of the robot until it is taken.
+
+    Args:
+        node: Whose remaps and clock hold.
+        joints: Those that matter; messages that name none of them are not looked at.
+        heard: Called when messages have come that name some.
+
+    Attributes:
+        stamp_age: Age of the last message by its stamp, s; of use where the robot's clock agrees with ours.
+        others: How many messages named none of the joints.
+    """
+
+    def __init__(self, node: Node, joints: Sequence[str], heard: Callable[[], None]) -> None:
+        self._node, self._joints, self._heard = node, frozenset(joints), heard
+        self.stamp_age: float | None = None
+        self.others = 0
+        self._newest: dict[tuple[str, ...], JointState] = {}
+        self._publishers = Publishers()
+        self._subscription = node.create_subscription(
+            JointStateMessage,
+            TOPIC,
+            self._take,  # type: ignore[arg-type]  # rclpy also takes callbacks with two arguments
+            qos.PARTS,
+        )
+
+    def _take(self, message: JointStateMessage, info: dict[str, int]) -> None:
+        ours = self._keep(message, info)
+        # Whatever has come meanwhile, too: where messages have queued up, only the newest shall count.
+        waiting, kind = self._subscription.handle, self._subscription.msg_type
+        with waiting:
+            while taken := waiting.take_message(kind, False):
+                ours |= self._keep(*taken)
+        if ours:
+            self._heard()
+
+    def _keep(self, message: JointStateMessage, info: dict[str, int]) -> bool:
+        names = tuple(message.name)
+        ours = self._joints.intersection(names)
+        if not ours:
+            self.others += 1
+            return False
+        stamp = message.header.stamp.sec + message.header.stamp.nanosec * 1e-9
+        self.stamp_age = self._node.get_clock().now().nanoseconds * 1e-9 - stamp
+        source = self._publishers.source(ours, info["publication_sequence_number"], time.monotonic())
+        self._newest[names] = JointState(
+            names, message.position, message.velocity, stamp, qos.received_at(info), message.effort, source
+        )
+        return True
+
+    def take(self) -> list[JointState]:
+        """Return what has come since the last time."""
+        states, self._newest = list(self._newest.values()), {}
+        return states
+
+    def rivals(self, now: float) -> str | None:
+        """Who claims the same joint, if two do; None if nobody does."""
+        joint = self._publishers.contested(now)
+        if joint is None:
+            return None
+        topic = self._subscription.topic_name
+        names = sorted(info.node_name for info in self._node.get_publishers_info_by_topic(topic))
+        return f"two publishers of {topic} claim '{joint}': {', '.join(names)}"
+
+
+class Publishers:
+    """Tells publishers apart, of whom rclpy does not say which one a message is from: each counts its messages."""
+
+    def __init__(self) -> None:
+        self._last: dict[str, int] = {}
+        self._source: dict[str, int] = {}
+        self._sources = 0
+        self._turns: defaultdict[str, deque[float]] = defaultdict(lambda: deque(maxlen=2))
+
+    def source(self, joints: frozenset[str], number: int | None, now: float) -> int | None:
+        """Return a name for the publisher of these joints' message; None where messages are not counted.
+
+        Args:
+            joints: Whose state it tells.
+            number: Of the message, by its publisher's count; it grows as long as the publisher is the same.
+            now: The time, s.
+        """
+        if not number:
+            return None
+        before = {self._source.get(joint) for joint in joints}
+        turned = [joint for joint in joints if number <= self._last.get(joint, 0)]
+        for joint in turned:
+            self._turns[joint].append(now)
+        if turned or len(before) > 1 or None in before:
+            self._sources += 1
+            self._source.update(dict.fromkeys(joints, self._sources))
+        self._last.update(dict.fromkeys(joints, number))
+        return self._source[next(iter(joints))]
+
+    def contested(self, now: float) -> str | None:
+        """A joint whose publishers have taken turns of late: one was there, another came, and the first spoke again."""
+        for joint, turns in self._turns.items():
+            if len(turns) == 2 and now - turns[0] < _RIVALRY:
+                return joint
+        return None

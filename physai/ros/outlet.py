@@ -1,0 +1,185 @@
+"""Standard output that never makes a node wait: a terminal may be stopped, a pipe unread, a disk full.
+
+rclpy writes log lines with the interpreter's lock held, so that a line which cannot be written stops every thread. Here
+they go to a pipe that is never full: a thread empties it into a queue with bounds, and another one writes that to where
+it belongs. What does not fit is counted, and said there when it can be.
+"""
+
+import contextlib
+import fcntl
+import io
+import os
+import select
+import sys
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+_ROOM = 2**16  # bytes that may wait for a slow reader, some 600 lines
+_PIPE = 2**20  # bytes of the pipe, for bursts
+_PATIENCE = 0.5  # s for what still waits when a node ends
+
+_outlets: "list[Outlet]" = []
+
+
+def open_closed() -> None:
+    """Put /dev/null where standard input, output or error is closed: a socket of DDS would take its number."""
+    while (number := os.open(os.devnull, os.O_RDWR)) <= 2:
+        os.set_inheritable(number, True)
+    os.close(number)
+
+
+def dropped_lines() -> int:
+    """How many lines have been lost since the program started."""
+    return sum(outlet.dropped for outlet in _outlets)
+
+
+@contextlib.contextmanager
+def outlets() -> Iterator[None]:
+    """Put outlets before standard output and error, for the rest of the program; at the end they get half a second."""
+    if os.isatty(2):
+        os.environ.setdefault("RCUTILS_COLORIZED_OUTPUT", "1")  # rcutils would look at the pipe
+    os.environ.setdefault("RCUTILS_LOGGING_BUFFERED_STREAM", "1")  # a line at a time, also to a pipe
+    # One for both keeps the order of their lines, where both are shown in one place.
+    made = [Outlet([1, 2])] if os.path.sameopenfile(1, 2) else [Outlet([1]), Outlet([2])]
+    _outlets.extend(made)
+    before = sys.stdout, sys.stderr
+    sys.stdout, sys.stderr = _text(1), _text(2)
+    for stream in before:
+        with contextlib.suppress(OSError, AttributeError):  # None, where it was closed
+            stream.flush()
+    try:
+        yield
+    finally:
+        end = time.monotonic() + _PATIENCE
+        for outlet in made:
+            outlet.close()
+        for outlet in made:
+            outlet.wait(end - time.monotonic())
+
+
+class Outlet:
+    """Stands before a descriptor: what is written to it never waits, and is passed on as fast as it is taken.
+
+    Args:
+        numbers: Descriptors that lead to the same place.
+
+    Attributes:
+        dropped: Lines that have been lost.
+    """
+
+    def __init__(self, numbers: Sequence[int]) -> None:
+        self.dropped = 0
+        self._numbers = numbers
+        self._real = os.dup(numbers[0])
+        self._source, pipe = os.pipe()
+        with contextlib.suppress(OSError):  # more than this user may have
+            fcntl.fcntl(pipe, fcntl.F_SETPIPE_SZ, _PIPE)
+        os.set_blocking(pipe, False)
+        for number in numbers:
+            os.dup2(pipe, number)
+        os.close(pipe)
+        self._changed = threading.Condition()
+        self._lines: list[bytes] = []
+        self._size = 0  # bytes of these lines
+        self._lost = 0  # lines that came behind them
+        self._ended = False
+        self._writer = threading.Thread(target=self._pass_on, name="outlet", daemon=True)
+        self._writer.start()
+        threading.Thread(target=self._take, name="outlet, in", daemon=True).start()
+
+    def close(self) -> None:
+        """Take nothing any more."""
+        null = os.open(os.devnull, os.O_WRONLY)
+        for number in self._numbers:
+            os.dup2(null, number)  # closes the pipe, so that its reader ends
+        os.close(null)
+
+    def wait(self, timeout: float) -> None:
+        """Wait until all is written, at most for so long, s."""
+        self._writer.join(max(0.0, timeout))
+
+    def _take(self) -> None:
+        rest = b""
+        while data := os.read(self._source, 2**16):
+            *lines, rest = (rest + data).split(b"\n")
+            if len(rest) > _ROOM:
+                lines, rest = [*lines, rest], b""
+            self._queue(lines)
+        self._queue([rest] if rest else [])
+        with self._changed:
+            self._ended = True
+            self._changed.notify()
+
+    def _queue(self, lines: list[bytes]) -> None:
+        with self._changed:
+            for line in lines:
+                # After a lost one all are, until there is room again: one gap, and it can be said where it is.
+                if self._lost or self._size + len(line) > _ROOM:
+                    self._lost += 1
+                    self.dropped += 1
+                else:
+                    self._lines.append(line + b"\n")
+                    self._size += len(line) + 1
+            self._changed.notify()
+
+    def _pass_on(self) -> None:
+        untold = 0
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._lines or self._lost or self._ended)
+                if not self._lines and not self._lost:
+                    return
+                lines, lost = self._lines, self._lost
+                self._lines, self._size, self._lost = [], 0, 0
+            unwritten = self._write(_gap(untold) + b"".join(lines) + _gap(lost))
+            if not unwritten:
+                untold = 0
+                continue
+            failed = min(len(lines), unwritten.count(b"\n"))
+            untold += failed + lost
+            with self._changed:
+                self.dropped += failed
+
+    def _write(self, data: bytes) -> bytes:
+        """Return what could not be written: a full disk, or a reader that has gone, is no reason to end."""
+        while data:
+            try:
+                data = data[os.write(self._real, data) :]
+            except BlockingIOError:  # another program has made it so
+                waiting = select.poll()
+                waiting.register(self._real, select.POLLOUT)
+                waiting.poll()
+            except OSError:
+                break
+        return data
+
+
+def _gap(lines: int) -> bytes:
+    return f"[WARN] {lines} lines of this output are missing here: they were not taken in time\n".encode() * (lines > 0)
+
+
+class _Descriptor(io.RawIOBase):
+    """Writes what there is room for, and never fails."""
+
+    def __init__(self, number: int) -> None:
+        self._number = number
+
+    def writable(self) -> bool:
+        return True
+
+    def fileno(self) -> int:
+        return self._number
+
+    def write(self, data: Any) -> int:
+        with contextlib.suppress(OSError):
+            rest = memoryview(data)
+            while rest:
+                rest = rest[os.write(self._number, rest) :]
+        return len(data)
+
+
+def _text(number: int) -> io.TextIOWrapper:
+    descriptor: Any = _Descriptor(number)  # which is as good as a buffered writer here: there is nothing to wait for
+    return io.TextIOWrapper(descriptor, "utf-8", "backslashreplace", line_buffering=True)

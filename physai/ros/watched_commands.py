@@ -1,0 +1,67 @@
+"""Velocity commands by way of a watchdog, and past it while it does not answer: zeros alone."""
+
+import math
+import time
+from collections.abc import Sequence
+
+from rclpy.node import Node
+from std_msgs.msg import Empty
+
+from physai.ros import qos
+from physai.ros.commands import VelocityCommands
+
+
+class WatchedCommands(VelocityCommands):
+    """Publishes to a command_watchdog, which tells that it lives; and, when it does not, zeros to the controller.
+
+    Args:
+        node: Whose remaps hold.
+        joints: How many velocities a command has.
+        watchdog: Name of its node, such as ``/command_watchdog``.
+        timeout: A watchdog that was silent for longer does not answer, s.
+
+    Attributes:
+        silences: How often it has ceased to answer.
+    """
+
+    def __init__(self, node: Node, joints: int, watchdog: str, timeout: float) -> None:
+        super().__init__(node, joints, f"{watchdog}/commands")
+        # There from the start: what has to be found first is late.
+        self._past = VelocityCommands(node, joints, partners=f"{watchdog}/heartbeat")
+        node.create_subscription(
+            Empty,
+            f"{watchdog}/heartbeat",
+            self._take_heartbeat,  # type: ignore[arg-type]  # rclpy also takes callbacks with two arguments
+            qos.SENSOR,
+        )
+        self.timeout = timeout
+        self.silences = 0
+        self._name = watchdog
+        self._last = -math.inf
+        self._answering = False
+
+    def _take_heartbeat(self, _: Empty, info: dict[str, int]) -> None:
+        self._last = qos.received_at(info)
+
+    @property
+    def rival(self) -> str | None:
+        """That another publisher commands the watchdog or the controller, and who; or None."""
+        return super().rival or self._past.rival
+
+    def silence(self, now: float) -> str | None:
+        """That the watchdog does not answer at a time, s; or None."""
+        before, self._answering = self._answering, now - self._last <= self.timeout
+        self.silences += before and not self._answering
+        return None if self._answering else f"the watchdog {self._name} does not answer"
+
+    def send(self, velocity: Sequence[float]) -> None:
+        """Publish a command; while the watchdog does not answer, zeros past it first."""
+        if time.monotonic() - self._last > self.timeout:
+            self._past.stop()
+        super().send(velocity)
+
+    def finish(self) -> None:
+        """Publish zeros on both ways until they have surely arrived: the watchdog may just have ceased to answer."""
+        self._last = -math.inf
+        super().finish()
+        self._past.wait()
