@@ -3,7 +3,7 @@
 The inference node (with -p watchdog:=/command_watchdog) publishes to ~/commands; this node passes commands on. It sends
 zeros when none has come for a while, and, until ~/reset, when another publisher has commanded the controller: one that
 does not publish ~/commands, too. It listens only while a controller listens to it, so that who commands it knows. It
-publishes ~/heartbeat, so that who commands it can stop the arm when it hangs or dies. Run it on the robot's side of
+publishes ~/heartbeat while it can hear them, so that who commands it can stop the arm when it hangs or dies. Run it on the robot's side of
 whatever may fail.
 """
 
@@ -85,7 +85,9 @@ class CommandWatchdog(StoppableNode):
             self._stop(self._conflict)
         elif time.monotonic() - self._last > self._config.timeout:
             self._stop(f"no command for {self._config.timeout:g} s")
-        self._heartbeat.publish(Empty())
+        # Not while commands would be lost: the arm would miss the beginning of a motion.
+        if time.monotonic() >= self._deaf_until and self._source is not None and self._source.get_publisher_count():
+            self._heartbeat.publish(Empty())
         heard = self._commands.unheard is None
         if heard and self._source is None:
             self._source = self.create_subscription(
