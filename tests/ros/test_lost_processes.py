@@ -51,13 +51,17 @@ def test_a_robot_that_stands_still_and_one_that_dies(driven, start, peer):
     assert delay < WITHIN
     peer.all_zeros(after=since + delay, commands=20)
     start("virtual_robot")  # at home, not where the other one died
-    peer.wait_state("active", after=since)
+    came = time.monotonic()
+    peer.wait_state("waiting", after=came)
+    peer.all_zeros(after=since + delay, commands=20)
+    peer.send_goal(*FAR)
+    peer.wait_state("active", after=came)
     peer.moved(after=time.monotonic(), commands=20)
 
 
 @pytest.mark.slow
 def test_a_node_that_stood_still_sends_zeros_first_and_no_burst(driven, peer):
-    _, node = driven()
+    _, node = driven(resume_timeout=10.0)
     for _ in range(3):
         node.signal(signal.SIGSTOP)
         peer.silent(1.0)
