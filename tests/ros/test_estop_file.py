@@ -111,7 +111,7 @@ def test_a_node_killed_in_an_emergency_stop_is_in_it_when_it_starts_again(policy
         peer.states.clear()
         with closed_loop(policy_path, peer=peer, state=tmp_path, goal=list(FAR)) as loop:
             peer.wait_state("estop")
-            assert "emergency stop before this start" in loop.node.output
+            loop.node.says("emergency stop before this start")
             wait_for(lambda: len(peer.commands) > 180)  # longer than it looks for others
             assert not any(any(velocity) for _, velocity in peer.commands)
             assert {state for _, state in peer.states} == {"estop"}

@@ -289,7 +289,7 @@ def test_that_come_again_after_three_seconds_move_nothing_before_a_new_goal(loop
     loop.peer.wait_state("waiting", after=since)
     loop.peer.all_zeros(after=since, commands=30)
     assert "no goal yet" in loop.diagnosis()[1]
-    assert any("goal forgotten: the robot was silent for 3" in line for line in loop.node.lines)
+    wait_for(lambda: any("goal forgotten: the robot was silent for 3" in line for line in loop.node.lines))
     loop.start_from_here()
 
 
@@ -311,5 +311,5 @@ def test_by_another_publisher_than_before_need_a_new_goal_however_soon_they_come
     since = time.monotonic()
     loop.peer.wait_state("waiting", after=since)
     loop.peer.all_zeros(after=loop.peer.states[-1][0], commands=20)
-    assert any("is told by another source than before" in line for line in loop.node.lines)
+    wait_for(lambda: any("is told by another source than before" in line for line in loop.node.lines))
     loop.start_from_here()
