@@ -1,6 +1,7 @@
 """How a node of physai starts, and how it ends: whatever happens, ``finish`` is called while ROS still works."""
 
 import argparse
+import gc
 import os
 import re
 import signal
@@ -84,6 +85,7 @@ def run(make_node: Callable[[], StoppableNode], module: str, about: str, kind: t
         try:
             return _run(make_node, caught)
         finally:
+            gc.collect()  # a node that was refused half made: it must go while ROS still works
             rclpy.try_shutdown()
             signals.ignore()
 
