@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PointStamped
 from rclpy.clock import Clock, ClockType
+from rclpy.exceptions import NameValidationException
 from std_msgs.msg import Bool, String
 from std_srvs.srv import SetBool, Trigger
 
@@ -268,7 +269,7 @@ def _commands(node: InferenceNode, joints: int, config: InferenceConfig) -> Velo
         return VelocityCommands(node, joints)
     try:
         return WatchedCommands(node, joints, config.watchdog, config.watchdog_timeout)
-    except (ValueError, RuntimeError) as error:  # InvalidTopicNameException, RCLError
+    except (NameValidationException, RuntimeError) as error:  # RuntimeError: RCLError
         raise UserError(f"watchdog: must be the name of a node, got '{config.watchdog}': {brief(error)}") from None
 
 
