@@ -98,28 +98,26 @@ def test_a_disk_that_stands_still_keeps_nobody_waiting(home, monkeypatch):
 
 
 def test_a_node_killed_in_an_emergency_stop_is_in_it_when_it_starts_again(policy_path, peer, tmp_path):
-    for how in ("topic", "service"):
-        with closed_loop(policy_path, peer=peer, state=tmp_path, goal=list(FAR)) as loop:
-            peer.moved(after=time.monotonic())
-            since = time.monotonic()
-            peer.emergency_stop() if how == "topic" else peer.call("/inference_node/estop")
-            peer.wait_state("estop", after=since)
-            loop.node.signal(signal.SIGKILL)
-            loop.node.wait()
-            loop.arm.leave()
-        peer.commands.clear()
-        peer.states.clear()
-        with closed_loop(policy_path, peer=peer, state=tmp_path, goal=list(FAR)) as loop:
-            peer.wait_state("estop")
-            loop.node.says("emergency stop before this start")
-            wait_for(lambda: len(peer.commands) > 180)  # longer than it looks for others
-            assert not any(any(velocity) for _, velocity in peer.commands)
-            assert {state for _, state in peer.states} == {"estop"}
-            assert peer.call("/inference_node/reset").success
-            peer.wait_state("waiting")
-            peer.send_goal(*FAR)
-            peer.moved(after=time.monotonic())
-            loop.arm.leave()
+    with closed_loop(policy_path, peer=peer, state=tmp_path, goal=list(FAR)) as loop:
+        peer.moved(after=time.monotonic())
+        since = time.monotonic()
+        peer.emergency_stop()
+        peer.wait_state("estop", after=since)
+        loop.node.signal(signal.SIGKILL)
+        loop.node.wait()
+        loop.arm.leave()
+    peer.commands.clear()
+    peer.states.clear()
+    with closed_loop(policy_path, peer=peer, state=tmp_path, goal=list(FAR)) as loop:
+        peer.wait_state("estop")
+        loop.node.says("emergency stop before this start")
+        wait_for(lambda: len(peer.commands) > 180)  # longer than it looks for others
+        assert not any(any(velocity) for _, velocity in peer.commands)
+        assert {state for _, state in peer.states} == {"estop"}
+        assert peer.call("/inference_node/reset").success
+        peer.wait_state("waiting")
+        peer.send_goal(*FAR)
+        peer.moved(after=time.monotonic())
     assert list((tmp_path / "physai").iterdir()) == []
 
 

@@ -13,7 +13,7 @@ from rclpy.qos import QoSProfile
 from sensor_msgs.msg import JointState
 
 from physai.ros import qos
-from tests.ros.loop import FAR, Arm, closed_loop
+from tests.ros.loop import Arm, closed_loop
 from tests.ros.peer import wait_for
 
 WITHIN = 0.15  # s
@@ -248,7 +248,7 @@ def test_with_every_joint_in_a_message_of_its_own_lead_to_the_goals(policy_path)
     with closed_loop(policy_path, max_velocity=1.0, limit_margin=0.2) as loop:
         loop.arm.change = apart(loop.arm)
         loop.peer.wait_state("waiting")
-        for angle in (0.3, 2.0, -1.5, -2.8):
+        for angle in (2.0, -1.5):
             since = time.monotonic()
             loop.peer.send_goal(0.4 * math.cos(angle), 0.4 * math.sin(angle))
             loop.peer.wait_state("active", after=since)
@@ -256,22 +256,20 @@ def test_with_every_joint_in_a_message_of_its_own_lead_to_the_goals(policy_path)
         assert "count: holds: state old" not in loop.diagnosis()[2]
 
 
-def test_of_two_publishers_that_claim_a_joint_are_a_reason_to_wait_that_names_both(policy_path):
-    with closed_loop(policy_path, goal=list(FAR)) as loop:
-        loop.peer.moved()
-        impostor = Node("impostor", context=loop.peer.node.context)
-        publisher = impostor.create_publisher(JointState, "/joint_states", 10)
-        change = loop.arm.change
-        loop.arm.change = lambda message: publisher.publish(message) or message
-        since = time.monotonic()
-        wait_for(lambda: "claim 'joint" in loop.diagnosis()[1], 5.0, loop.diagnosis()[1])
-        assert re.search(r"two publishers of /joint_states claim 'joint[12]': impostor, peer", loop.diagnosis()[1])
-        loop.peer.all_zeros(after=since + WITHIN, commands=20)
-        loop.arm.change = change
-        impostor.destroy_node()
-        loop.peer.wait_state("waiting")
-        wait_for(lambda: "no goal yet" in loop.diagnosis()[1] and "claim" not in loop.diagnosis()[1], 10.0)
-        loop.peer.all_zeros(after=since + WITHIN, commands=20)
+def test_of_two_publishers_that_claim_a_joint_are_a_reason_to_wait_that_names_both(loop):
+    loop.start()
+    impostor = Node("impostor", context=loop.peer.node.context)
+    publisher = impostor.create_publisher(JointState, "/joint_states", 10)
+    loop.arm.change = lambda message: publisher.publish(message) or message
+    since = time.monotonic()
+    wait_for(lambda: "claim 'joint" in loop.diagnosis()[1], 5.0, loop.diagnosis()[1])
+    assert re.search(r"two publishers of /joint_states claim 'joint[12]': impostor, peer", loop.diagnosis()[1])
+    loop.peer.all_zeros(after=since + WITHIN, commands=20)
+    loop.arm.change = lambda message: message
+    impostor.destroy_node()
+    loop.peer.wait_state("waiting")
+    wait_for(lambda: "no goal yet" in loop.diagnosis()[1] and "claim" not in loop.diagnosis()[1], 10.0)
+    loop.peer.all_zeros(after=since + WITHIN, commands=20)
 
 
 @pytest.mark.parametrize("as_another", [False, True], ids=["by the same publisher", "by another"])

@@ -119,23 +119,21 @@ def test_whole_numbers_are_taken_for_floats_and_misspelt_names_warn_with_the_nea
         wait_for(lambda: 95 < rate() < 105, 10.0, "100 commands a second")  # when this process is not busy itself
 
 
-@pytest.mark.parametrize(
-    ("module", "domain"),
-    [
-        *(("command_watchdog", domain) for domain in ("abc", "-1", "233", "7x")),
-        *((module, "999") for module in ("inference_node", "virtual_robot", "record", "demo")),
-    ],
-)
-def test_a_domain_that_there_is_not_is_refused_in_one_line(start, policy_path, module, domain):
-    command = [sys.executable, "-m", f"physai.ros.{module}"]
-    path = [f"policy_path={policy_path}"] if module == "demo" else []
-    process = start.run(command + path, {"ROS_DOMAIN_ID": domain})
-    assert process.wait(60) == 2
-    assert process.lines[-1] == f"error: ROS_DOMAIN_ID: must be a whole number from 0 to 232, got '{domain}'"
-    assert "Traceback" not in process.output
+def test_a_domain_that_there_is_not_is_refused_in_one_line(start, policy_path):
+    commands = {module: [] for module in ("inference_node", "virtual_robot", "command_watchdog", "record")}
+    commands["demo"] = [f"policy_path={policy_path}"]
+    processes = [
+        start.run([sys.executable, "-m", f"physai.ros.{module}", *arguments], {"ROS_DOMAIN_ID": "999"})
+        for module, arguments in commands.items()
+    ]
+    for process in processes:
+        assert process.wait(60) == 2
+        assert process.lines[-1] == "error: ROS_DOMAIN_ID: must be a whole number from 0 to 232, got '999'"
+        assert "Traceback" not in process.output
 
 
-def test_an_environment_refuses_it_too(monkeypatch):
-    monkeypatch.setenv("ROS_DOMAIN_ID", "999")
-    with pytest.raises(UserError, match="ROS_DOMAIN_ID: must be a whole number from 0 to 232, got '999'"):
+@pytest.mark.parametrize("domain", ["999", "abc", "-1", "233", "7x"])
+def test_an_environment_refuses_it_too(monkeypatch, domain):
+    monkeypatch.setenv("ROS_DOMAIN_ID", domain)
+    with pytest.raises(UserError, match=f"ROS_DOMAIN_ID: must be a whole number from 0 to 232, got '{domain}'"):
         RobotLink(["joint1"], 0.1, None, [])
