@@ -97,6 +97,11 @@ def check(config: ControllerConfig, metadata: Metadata) -> None:
         raise UserError(f"max_velocity: {config.max_velocity} rad/s is beyond the robot's limit, {slowest:g} rad/s")
     if config.clock_jump <= LATE * period:
         raise UserError(f"clock_jump: must be longer than {LATE:g} control periods, got {config.clock_jump}")
+    if config.resume_timeout < config.state_timeout:  # a goal would be forgotten before anything holds
+        raise UserError(
+            f"resume_timeout: must be as long as state_timeout, {config.state_timeout} s, at least, "
+            f"got {config.resume_timeout}"
+        )
     span = (metadata.position_limit[:, 1] - metadata.position_limit[:, 0]).min()
     if 2 * config.limit_margin >= span:
         raise UserError(f"limit_margin: {config.limit_margin} rad leaves no room between the position limits")

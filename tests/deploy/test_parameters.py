@@ -262,6 +262,12 @@ def test_a_jump_of_the_clock_that_is_no_longer_than_a_late_update_is_refused(pol
     Controller(policy, ControllerConfig(clock_jump=0.061))
 
 
+def test_a_time_after_which_goals_are_forgotten_that_is_shorter_than_a_hold_takes_is_refused(policy):
+    Controller(policy, ControllerConfig(resume_timeout=0.1))
+    expected = "resume_timeout: must be as long as state_timeout, 0.1 s, at least, got 0.09"
+    assert refused(policy, resume_timeout=0.09) == expected
+
+
 @pytest.mark.parametrize(
     ("too_much", "enough"),
     [
