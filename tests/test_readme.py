@@ -1,5 +1,6 @@
 """The README's Python examples do what they show."""
 
+import ast
 import dataclasses
 import re
 from pathlib import Path
@@ -30,6 +31,18 @@ def test_the_controller_of_the_readme_reaches_its_goal(exported_run, monkeypatch
     printed = capsys.readouterr().out
     assert "('joint1', 'joint2') (0.3, 0.53) 50.0" in printed
     assert "State.REACHED" in printed
+
+
+def test_each_row_of_the_tables_of_faults_has_a_test_that_names_it_and_no_test_names_another():
+    tables = re.findall(r"\| what happens \|[^\n]*\n\|[-|]+\|\n((?:\|.*\|\n)+)", README)
+    rows = [row.split(" | ")[0].removeprefix("| ") for table in tables for row in table.splitlines()]
+    assert len(rows) == len(set(rows)) > 30
+    named = set()
+    for path in Path(__file__).parent.rglob("test_*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Call) and ast.unparse(node.func) == "pytest.mark.fault":
+                named.add(ast.literal_eval(node.args[0]))
+    assert named == set(rows)
 
 
 def parameter_tables() -> dict[str, list[list[str]]]:

@@ -103,6 +103,7 @@ def recovers(robot, stay_for=4, reset=False):
 # Row: no state yet.
 
 
+@pytest.mark.fault("no joint state yet")
 def test_without_a_state_it_waits_and_sends_nothing(robot):
     for command in (*robot.ticks(20, state=None), robot.tick(state=None, goal=FAR_GOAL)):
         assert command.velocity is None
@@ -132,6 +133,7 @@ def test_with_a_state_and_a_goal_it_drives_from_zero_through_the_acceleration_li
 # Row: state older than state_timeout.
 
 
+@pytest.mark.fault("state older than `state_timeout` (0.1 s)")
 def test_an_old_state_holds_and_five_good_ones_resume(moving):
     for command in moving.ticks(5, state=None):
         assert command.state is State.ACTIVE
@@ -173,6 +175,7 @@ def test_a_gap_while_it_recovers_starts_the_count_anew(moving):
 # Row: joints reordered, extra joints.
 
 
+@pytest.mark.fault("joints reordered, extra joints")
 def test_reordered_and_extra_joints_make_no_difference(policy):
     plain, mixed = Robot(policy), Robot(policy)
     for robot in (plain, mixed):
@@ -206,6 +209,7 @@ MALFORMED = {
 
 
 @pytest.mark.parametrize(("kind", "bad"), MALFORMED.items())
+@pytest.mark.fault("joint named twice, lengths disagree, position NaN or infinite")
 def test_a_malformed_state_is_rejected_counted_and_soon_too_old(moving, kind, bad):
     for command in moving.ticks(5, **bad):
         assert command.state is State.ACTIVE
@@ -236,6 +240,7 @@ def test_good_states_that_end_a_hold_come_in_a_row(moving, bad):
 # Row: velocity empty or NaN.
 
 
+@pytest.mark.fault("velocity missing or NaN")
 def test_a_missing_velocity_is_estimated_where_that_is_allowed(policy):
     robot, knowing = Robot(policy, allow_velocity_estimate=True), Robot(policy)
     for each in (robot, knowing):
@@ -256,6 +261,7 @@ IMPLAUSIBLE = {
 
 
 @pytest.mark.parametrize(("kind", "bad"), IMPLAUSIBLE.items())
+@pytest.mark.fault("position jump, velocity that cannot be true, stamp repeated or backwards")
 def test_an_implausible_state_is_rejected_and_holds_at_once(moving, kind, bad):
     if "stamp" in bad:
         bad = {"stamp": moving.now + bad["stamp"]}  # that of the state before, or earlier
@@ -310,6 +316,7 @@ def test_after_any_number_of_turns_it_drives_as_after_none(policy, turns):
 
 
 @pytest.mark.parametrize("side", [1, -1])
+@pytest.mark.fault("joint beyond its position limit")
 def test_beyond_a_limit_it_moves_slowly_inward_and_not_outward(robot, side):
     robot.position = [0.0, side * 2.65]
     robot.tick(goal=FAR_GOAL)
@@ -335,6 +342,7 @@ def test_at_a_limit_outward_motion_stops_at_once(robot):
     assert robot.counters["ticks at a position limit"] == 3
 
 
+@pytest.mark.fault("joint beyond its position limit")
 def test_far_beyond_a_limit_is_a_fault(moving):
     moving.position = [0.5, -2.85]
     commands = moving.ticks(2, velocity=(0.0, -7.0), after=0.9)
@@ -383,6 +391,7 @@ BAD_GOALS = {
 
 
 @pytest.mark.parametrize(("kind", "bad"), BAD_GOALS.items())
+@pytest.mark.fault("goal not finite, of another size or frame")
 def test_a_bad_goal_is_rejected_counted_and_the_old_one_stays(policy, kind, bad):
     robot, undisturbed = Robot(policy), Robot(policy)
     for each in (robot, undisturbed):
@@ -405,6 +414,7 @@ def test_a_bad_goal_is_no_goal(robot):
 # Row: goal unreachable.
 
 
+@pytest.mark.fault("goal nearer or farther than those that the policy was trained on")
 def test_an_unreachable_goal_is_projected_onto_the_reachable_ones_where_that_is_set(policy):
     robot = Robot(policy, unreachable_goal="project")
     robot.drive()
@@ -420,6 +430,7 @@ def test_an_unreachable_goal_is_projected_onto_the_reachable_ones_where_that_is_
 
 
 @pytest.mark.parametrize("failure", ALL_FAILURES)
+@pytest.mark.fault("policy gives NaN or another shape (commands or memory), raises, is too slow")
 def test_a_policy_that_fails_stops_the_arm_at_once_and_three_times_in_a_row_is_a_fault(moving, failure):
     moving.policy.trouble = failure
     for count, state in enumerate([State.ACTIVE, State.ACTIVE, State.FAULT], start=1):
@@ -490,6 +501,7 @@ def test_the_reason_of_an_exception_is_the_last_line_of_its_message(moving, mess
 # Row: policy output beyond its range.
 
 
+@pytest.mark.fault("policy gives more than its range")
 def test_a_command_beyond_the_policy_s_range_is_clamped_and_counted(moving):
     moving.policy.trouble = lambda command: np.array([1e6, -1.0])
     command = moving.ticks(30)[-1]
@@ -502,6 +514,7 @@ def test_a_command_beyond_the_policy_s_range_is_clamped_and_counted(moving):
 # Row: update called late.
 
 
+@pytest.mark.fault("more than three periods between two updates")
 def test_a_late_update_is_zero_for_that_tick_and_nothing_is_caught_up(moving):
     command = moving.tick(after=3.1 * PERIOD)
     assert is_stopped(command, State.ACTIVE)
@@ -539,6 +552,7 @@ def test_a_late_update_at_a_reached_goal_does_not_leave_it(robot):
 
 
 @pytest.mark.parametrize("jump", [-1e6, -5.0, -0.001, 1.1, 5.0, 1e9])
+@pytest.mark.fault("clock jumps backwards or far ahead, or stands still")
 def test_a_jump_of_the_clock_holds(moving, jump):
     moving.now += jump
     command = moving.controller.update(moving.now, moving.state(stamp=0.0) if jump > 0 else None)
@@ -570,6 +584,7 @@ def test_the_position_that_comes_with_a_late_update_is_taken_but_does_not_count_
     assert recovers(moving, stay_for=1)
 
 
+@pytest.mark.fault("clock jumps backwards or far ahead, or stands still")
 def test_a_clock_that_stands_still_holds_from_the_third_further_update_on(moving):
     for _ in range(2):
         assert moving.tick(after=0.0, state=None).velocity.any()
@@ -623,6 +638,7 @@ def test_a_jump_of_the_clock_holds_even_where_one_good_state_ends_a_hold(policy)
 # Row: emergency stop.
 
 
+@pytest.mark.fault("`emergency_stop()`")
 def test_an_emergency_stop_is_zero_at_once_and_stays_until_reset(moving):
     moving.controller.emergency_stop()
     for command in moving.ticks(200):
@@ -735,6 +751,7 @@ def test_a_reset_without_need_changes_nothing(policy):
 INTERLOCKS = ("not enabled", "a person is near")
 
 
+@pytest.mark.fault('`interlocks=["..."]` given to `update`')
 def test_an_interlock_stops_the_arm_at_once_without_a_fault_and_without_asking_the_policy(moving):
     for interlocks in (INTERLOCKS, INTERLOCKS[:1], list(INTERLOCKS[1:])):
         moving.policy.forget()

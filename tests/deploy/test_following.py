@@ -91,6 +91,7 @@ def poses(count):
 
 @pytest.mark.parametrize("joint", [0, 1])
 @pytest.mark.parametrize(("of", "change", "how"), BROKEN.values(), ids=BROKEN)
+@pytest.mark.fault("an arm that does not do what it is told (`following_error`, see below)")
 def test_a_drive_that_does_not_do_what_it_is_told_is_a_fault_that_says_how(policy, of, change, how, joint):
     noise = np.random.default_rng(3)
     for pose in poses(10):
@@ -108,6 +109,7 @@ def test_a_drive_that_does_not_do_what_it_is_told_is_a_fault_that_says_how(polic
 
 @pytest.mark.parametrize("joint", [0, 1])
 @pytest.mark.parametrize("moving", [False, True], ids=["from the start", "while it moves"])
+@pytest.mark.fault("an arm that does not do what it is told (`following_error`, see below)")
 def test_an_encoder_that_is_stuck_is_a_fault_though_its_stamps_are_fresh(policy, joint, moving):
     for pose in poses(10):
         arm = Arm(policy, pose)
@@ -211,6 +213,7 @@ def test_a_share_of_one_lets_a_weak_drive_pass_and_is_taken_while_it_runs(policy
 
 @pytest.mark.parametrize("joint", [0, 1])
 @pytest.mark.parametrize("change", [lambda v: -v, lambda v: v * 180 / math.pi / 10, lambda v: v + 0.5])
+@pytest.mark.fault("reported velocities contradict the way that the positions went (`velocity_error`)")
 def test_velocities_that_contradict_positions_are_refused_and_hold(policy, joint, change):
     arm = Arm(policy)
     arm.push(2.0, 2.0)
@@ -225,6 +228,7 @@ def test_velocities_that_contradict_positions_are_refused_and_hold(policy, joint
 # Progress.
 
 
+@pytest.mark.fault("distance to the goal has not fallen for `progress_timeout` (10 s)")
 def test_a_goal_that_comes_no_nearer_is_given_up_until_another_comes(policy):
     arm = Arm(policy, progress_timeout=1.0)
     arm.push(0.0, 0.0)
@@ -256,6 +260,7 @@ def test_slow_progress_is_progress(policy):
 # Effort.
 
 
+@pytest.mark.fault("effort beyond its limit for `effort_time` (0.5 s), where the state tells it")
 def test_an_effort_beyond_its_limit_for_a_while_is_a_fault(policy):
     arm = Arm(policy)
     arm.run(0.5, FAR_GOAL)

@@ -65,6 +65,7 @@ class Arm:
 
 @pytest.mark.parametrize("rate", [50, 200, 1000])
 @pytest.mark.parametrize("first", [True, False], ids=["before", "after"])
+@pytest.mark.fault("a message that names none of the policy's joints, such as a gripper's")
 def test_a_gripper_beside_the_arm_neither_restarts_a_recovery_nor_counts_as_refused(policy, rate, first):
     arm, fingers = Arm(policy), [("finger", "thumb")] * (rate // 50)
     messages = [*fingers, NAMES] if first else [NAMES, *fingers]
@@ -122,6 +123,7 @@ def pursue(arm, goal, tell):
     ],
     ids=["both at once", "in turn", "with a finger", "now and then whole"],
 )
+@pytest.mark.fault("messages that name some of the joints")
 def test_an_arm_that_tells_of_its_joints_in_parts_reaches_its_goals_as_one_that_does_not(policy, tell):
     parts, whole = Arm(policy), Arm(policy)
     for arm in (parts, whole):
@@ -188,6 +190,7 @@ def test_a_bad_message_of_one_joint_starts_the_rounds_anew(policy):
 # Row: a robot that was away.
 
 
+@pytest.mark.fault("robot silent for longer than `resume_timeout` (1 s), or told by another source than before")
 def test_a_robot_that_was_silent_for_3_s_and_is_back_elsewhere_does_not_move_before_a_new_goal(policy):
     arm = Arm(policy)
     arm.run(1.0, goal=FAR_GOAL)
@@ -221,6 +224,7 @@ def test_after_a_shorter_gap_it_drives_on_to_its_goal(policy, gap):
 
 
 @pytest.mark.parametrize("messages", [[], [NAMES[:1], NAMES[1:]]], ids=["whole", "in parts"])
+@pytest.mark.fault("robot silent for longer than `resume_timeout` (1 s), or told by another source than before")
 def test_another_source_of_joint_states_forgets_the_goal(policy, messages):
     arm = Arm(policy)
     arm.source = "driver"

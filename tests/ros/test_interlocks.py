@@ -36,6 +36,7 @@ def test_another_commander_from_before_the_start_is_not_disturbed(policy_path, r
         peer.moved()
 
 
+@pytest.mark.fault("another publisher of commands")
 def test_another_commander_that_appears_ends_the_motion_for_good(loop):
     since = loop.start()
     rival = loop.peer.node.create_publisher(Float64MultiArray, TOPIC, 1)

@@ -256,6 +256,7 @@ def test_with_every_joint_in_a_message_of_its_own_lead_to_the_goals(policy_path)
         assert "count: holds: state old" not in loop.diagnosis()[2]
 
 
+@pytest.mark.fault("two publishers claim the same joint")
 def test_of_two_publishers_that_claim_a_joint_are_a_reason_to_wait_that_names_both(loop):
     loop.start()
     impostor = Node("impostor", context=loop.peer.node.context)

@@ -70,6 +70,7 @@ def test_a_node_that_never_had_a_say_ends_without_a_word(policy_path):
         assert loop.peer.commands == []
 
 
+@pytest.mark.fault("Ctrl-C, Ctrl-Z, or any number of signals")
 def test_a_storm_of_signals_ends_it_as_one_does(policy_path):
     with closed_loop(policy_path, goal=GOAL) as loop:
         loop.peer.moved()

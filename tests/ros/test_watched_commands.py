@@ -40,6 +40,7 @@ def drive(watched):
 
 
 @pytest.mark.parametrize("number", [signal.SIGSTOP, signal.SIGKILL])
+@pytest.mark.fault("watchdog silent for `watchdog_timeout` (0.1 s)")
 def test_the_node_stops_the_arm_of_a_watchdog_that_hangs_or_dies_and_goes_on_when_it_is_back(watched, number):
     drive(watched)
     for _ in range(2 if number == signal.SIGSTOP else 1):
@@ -63,6 +64,7 @@ def test_the_node_stops_the_arm_of_a_watchdog_that_hangs_or_dies_and_goes_on_whe
         assert max(map(abs, first)) <= 0.05  # two periods of the acceleration limit at most
 
 
+@pytest.mark.fault("node silent for the watchdog's `timeout` (0.1 s)")
 def test_the_watchdog_stops_the_arm_of_a_node_that_hangs(watched):
     drive(watched)
     since = time.monotonic()
@@ -76,6 +78,7 @@ def test_the_watchdog_stops_the_arm_of_a_node_that_hangs(watched):
     watched.peer.moved(after=time.monotonic())
 
 
+@pytest.mark.fault("another publisher of commands")
 def test_a_third_commander_is_a_rival_of_both(watched):
     drive(watched)
     other = Peer(watched.peer.domain)
