@@ -82,6 +82,7 @@ _OUTSIDE = ("scratch_dir", "tracking_uri")  # where a resumed run would write, b
 _INTERPOLATION = re.compile(r"\$\{(?:[\w.\[\]@/-]+\}|(?:add|ceil_div|cores_of_job|jobs_at_once):)")
 _MOST_BYTES = 2**20
 _DEEPEST = 40
+_MOST_VALUES = 20_000
 
 _Key = tuple[str | int, ...]
 
@@ -170,12 +171,31 @@ def checked(
     own = tuple(given)
     _refuse((fault for fault in _interpolations(node) if not _is_own(fault, own, resolved=False)), path)
     try:
-        plain = OmegaConf.to_container(OmegaConf.create(node), resolve=True)
+        config = OmegaConf.create(node)
+        _count(config)
+        plain = OmegaConf.to_container(config, resolve=True)
     except Exception as error:  # whatever OmegaConf makes of it
         raise UserError(f"{path}: the run's config is damaged ({' '.join(str(error).split())[:80]})") from None
     _refuse((fault for fault in _faults(plain, allow, resume) if not _is_own(fault, own, resolved=True)), path)
     _refuse((fault for fault in _impostors(plain, allow) if not _is_own(fault, own, resolved=True)), path)
     return plain
+
+
+def _count(config: Any) -> None:
+    """Refuse a config that grows out of all bounds where interpolations name lists of interpolations.
+
+    Raises:
+        ValueError: If it does.
+    """
+    waiting, count = [config], 0
+    while waiting:
+        node = waiting.pop()
+        count += 1
+        if count > _MOST_VALUES:
+            raise ValueError(f"more than {_MOST_VALUES:,} values")
+        if OmegaConf.is_config(node):
+            keys = range(len(node)) if OmegaConf.is_list(node) else list(node)
+            waiting.extend(node[key] for key in keys if not OmegaConf.is_missing(node, key))
 
 
 def check_links(run_dir: Path) -> None:

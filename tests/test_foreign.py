@@ -274,3 +274,9 @@ def test_links_within_a_run_folder_stay(run):
 def test_a_damaged_summary_is_one_line(run, capsys, content):
     (run / "summary.json").write_text(content)
     assert "summary is damaged" in refused(capsys, train._resume, run, [])
+
+
+def test_lists_of_lists_of_interpolations_are_refused_before_they_grow():
+    node = {"first": ["x"] * 8} | {f"{n}": [f"${{{'first' if n == 0 else n - 1}}}"] * 8 for n in range(9)}
+    with pytest.raises(UserError, match=r"the run's config is damaged \(more than 20,000 values\)"):
+        foreign.checked(node, Path("config.yaml"))

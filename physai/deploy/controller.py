@@ -162,10 +162,12 @@ class Controller:
         self._needed = self.config.recovery_states
         return True
 
-    def forget_goal(self) -> None:
-        """Wait for a new goal."""
+    def forget_goal(self) -> bool:
+        """Wait for a new goal; return whether there was one."""
+        had = self._goal is not None
         self._goal, self._reached, self._gave_up = None, False, ""
         self._progress.restart()
+        return had
 
     def snapshot(self) -> dict[str, Any]:
         """State, its reasons and counters, for diagnostics; plain values only."""

@@ -85,8 +85,9 @@ class CommandWatchdog(StoppableNode):
             self._stop(self._conflict)
         elif time.monotonic() - self._last > self._config.timeout:
             self._stop(f"no command for {self._config.timeout:g} s")
-        # Not while commands would be lost: the arm would miss the beginning of a motion.
-        if time.monotonic() >= self._deaf_until and self._source is not None and self._source.get_publisher_count():
+        # Not while commands would be lost: the arm would miss the beginning of a motion, or seem not to follow.
+        passing = time.monotonic() >= self._deaf_until and not self._conflict
+        if passing and self._source is not None and self._source.get_publisher_count():
             self._heartbeat.publish(Empty())
         heard = self._commands.unheard is None
         if heard and self._source is None:

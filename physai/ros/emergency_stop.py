@@ -29,7 +29,8 @@ class EmergencyStopTopic:
         for profile in qos.EMERGENCY:
             node.create_subscription(Bool, TOPIC, self._take, profile, event_callbacks=qos.SILENT_SUBSCRIPTION)
         # What latched publishers said last. A message does not tell whose it is, but has a number: it follows the one
-        # with the number before; if there are several, a false, so that a true is only forgotten when it must be.
+        # with the number before, a false if there are several. A false takes the place of a true only where each
+        # publisher has had its say: else the true may be another's. Too many are forgotten when all are asked again.
         self._last: Counter[tuple[int, bool]] = Counter()
         self._latched = self._subscribe()
         self._asked = -_AGAIN
@@ -49,24 +50,27 @@ class EmergencyStopTopic:
 
     def _take_latched(self, message: Bool, info: dict[str, int]) -> None:
         self._take(message)
-        number = info["publication_sequence_number"]
-        for before in ((number - 1, False), (number - 1, True)):
-            if self._last[before]:
-                self._last[before] -= 1
-                break
+        number = info["publication_sequence_number"] or 0  # None from middlewares that do not count
+        if self._last[number - 1, False]:
+            self._last[number - 1, False] -= 1
+        elif self._last[number - 1, True] and (message.data or self._last.total() >= len(self._latching())):
+            self._last[number - 1, True] -= 1
         self._last[number, message.data] += 1
         self._last = +self._last
 
-    def held(self) -> str | None:
-        """Why a reset would be wrong now, or None: who latches a true still does."""
-        if time.monotonic() - self._asked < _AGAIN:
-            return f"looking whether {TOPIC} is still true: call again"
-        latching = [
+    def _latching(self) -> list[str]:
+        return [
             info.node_name
             for info in self._node.get_publishers_info_by_topic(TOPIC)
             if info.qos_profile.durability is DurabilityPolicy.TRANSIENT_LOCAL
             and info.qos_profile.reliability is ReliabilityPolicy.RELIABLE
         ]
+
+    def held(self) -> str | None:
+        """Why a reset would be wrong now, or None: who latches a true still does."""
+        if time.monotonic() - self._asked < _AGAIN:
+            return f"looking whether {TOPIC} is still true: call again"
+        latching = self._latching()
         if not latching or not any(pressed for _, pressed in self._last):
             return None
         # Who said it may be one that has left: ask those who are there.

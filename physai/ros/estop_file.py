@@ -37,7 +37,8 @@ class EmergencyStopFile:
             _try(self.path.with_name(f"{self.path.name}.{os.getpid()}"))
         except (OSError, RuntimeError) as error:  # RuntimeError: who has no home
             self.unusable = _why(error, self.path)
-        self._wanted = self._there = self._synced = self.stopped
+        self._wanted = self._there = self.stopped
+        self._synced: bool | None = self.stopped  # what the disk holds for sure; None: it may be either
         self._changed = threading.Condition()
         self._ended = False
         self._thread = threading.Thread(target=self._work, name="estop_file", daemon=True)
@@ -72,6 +73,7 @@ class EmergencyStopFile:
                 wanted = self._wanted
                 if wanted == self._synced:
                     return
+            self._synced = None
             try:
                 self._write(wanted)
                 self._synced, self.failure = wanted, ""
@@ -119,6 +121,7 @@ def _try(path: Path) -> None:
             file.write("whether an emergency stop could be remembered\n")
             file.flush()
             os.fsync(file.fileno())
+        _sync(path.parent)
     finally:
         path.unlink(missing_ok=True)
 

@@ -65,6 +65,7 @@ class InferenceNode(StoppableNode):
         super().__init__("inference_node")
         self._started = time.monotonic()
         self._unheard = self._started  # when no controller listened, for the last time
+        self._arrived = self._started  # when commands reached the robot, for the last time
         self.config = config = declare(self, InferenceConfig, self._configure)
         policy = _load(config)
         self._controller = Controller(policy, config)
@@ -147,8 +148,9 @@ class InferenceNode(StoppableNode):
         if (held := self._stop_topic.held()) is not None:
             response.success, response.message = False, held
             return response
-        self._goal = None
         latched = self._controller.reset()
+        if latched:
+            self._goal = None
         self._tick()
         self._stop_file.forget()
         response.success = True
@@ -215,7 +217,18 @@ class InferenceNode(StoppableNode):
             found.append("looking for other nodes")
         elif self._enabled and not self._contested:
             self._publishing = True
+        if silence is None and unheard is None:
+            self._arrived = now
+        elif self._publishing and now - self._arrived > self._controller.config.resume_timeout:
+            self._give_up_goal(f"commands have not reached the robot for {self._controller.config.resume_timeout:g} s")
         return found
+
+    def _give_up_goal(self, why: str) -> None:
+        """Who takes the arm elsewhere meanwhile does not expect it to go on by itself."""
+        forgotten = self._controller.forget_goal() or self._goal is not None
+        self._goal = None
+        if forgotten:
+            self.get_logger().warning(f"goal forgotten: {why}")
 
     def _publish(self, command: Command) -> None:
         # A disabled node does not disturb another one, once it stands still, and unless there is an emergency.

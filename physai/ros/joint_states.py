@@ -11,6 +11,8 @@ from physai.deploy import JointState
 from physai.ros import qos
 
 TOPIC = "/joint_states"
+# Numbers of lost messages are skipped, at most so many and so many a second; farther on counts somebody else.
+_LOST, _FASTEST = 64, 2000.0
 _RIVALRY = 3.0  # s; two publishers are rivals for so long after they have taken turns
 
 
@@ -45,7 +47,9 @@ class JointStates:
         # Whatever has come meanwhile, too: where messages have queued up, only the newest shall count.
         waiting, kind = self._subscription.handle, self._subscription.msg_type
         with waiting:
-            while taken := waiting.take_message(kind, False):
+            for _ in range(qos.PARTS.depth):  # a flood must not keep the tick waiting for its end
+                if not (taken := waiting.take_message(kind, False)):
+                    break
                 ours |= self._keep(*taken)
         if ours:
             self._heard()
@@ -59,6 +63,7 @@ class JointStates:
         stamp = message.header.stamp.sec + message.header.stamp.nanosec * 1e-9
         self.stamp_age = self._node.get_clock().now().nanoseconds * 1e-9 - stamp
         source = self._publishers.source(ours, info["publication_sequence_number"], time.monotonic())
+        self._newest.pop(names, None)  # the order is that in which they came
         self._newest[names] = JointState(
             names, message.position, message.velocity, stamp, qos.received_at(info), message.effort, source
         )
@@ -83,7 +88,7 @@ class Publishers:
     """Tells publishers apart, of whom rclpy does not say which one a message is from: each counts its messages."""
 
     def __init__(self) -> None:
-        self._last: dict[str, int] = {}
+        self._last: dict[str, tuple[int, float]] = {}
         self._source: dict[str, int] = {}
         self._sources = 0
         self._turns: defaultdict[str, deque[float]] = defaultdict(lambda: deque(maxlen=2))
@@ -99,13 +104,15 @@ class Publishers:
         if not number:
             return None
         before = {self._source.get(joint) for joint in joints}
-        turned = [joint for joint in joints if number <= self._last.get(joint, 0)]
+        last = {joint: self._last.get(joint, (0, now)) for joint in joints}
+        turned = [joint for joint, (count, _) in last.items() if number <= count]
+        ahead = any(count and number - count > _LOST + _FASTEST * (now - at) for count, at in last.values())
         for joint in turned:
             self._turns[joint].append(now)
-        if turned or len(before) > 1 or None in before:
+        if turned or ahead or len(before) > 1 or None in before:
             self._sources += 1
             self._source.update(dict.fromkeys(joints, self._sources))
-        self._last.update(dict.fromkeys(joints, number))
+        self._last.update(dict.fromkeys(joints, (number, now)))
         return self._source[next(iter(joints))]
 
     def contested(self, now: float) -> str | None:

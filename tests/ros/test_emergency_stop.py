@@ -7,6 +7,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from std_msgs.msg import Bool, String
 
 from physai.ros import qos
+from physai.ros.emergency_stop import EmergencyStopTopic
 from tests.ros.loop import FAR, closed_loop
 from tests.ros.peer import Peer, wait_for
 
@@ -152,6 +153,29 @@ def test_a_reset_is_refused_while_one_of_two_latched_stops_is_still_pressed(loop
     finally:
         other.close()
     wait_for(lambda: loop.peer.call("/inference_node/reset").success, 10.0, "a reset once the pressed one has left")
+
+
+def test_a_false_does_not_take_away_the_true_of_another_button(peer):
+    """As they come when both are asked again: A has said false and true, B false, true and false."""
+    topic = EmergencyStopTopic(peer.node, lambda: None)
+    peer.publisher(Bool, "/emergency_stop", PROFILES["latched"])
+    other = peer.node.create_publisher(Bool, "/emergency_stop", PROFILES["latched"])
+    wait_for(lambda: len(topic._latching()) == 2)
+    topic._last.clear()
+    topic._take_latched(Bool(data=True), {"publication_sequence_number": 2})
+    topic._take_latched(Bool(data=False), {"publication_sequence_number": 3})
+    assert "is still true" in topic.held()
+    peer.node.destroy_publisher(other)
+
+
+def test_without_numbers_a_true_holds_until_all_are_asked_again(peer):
+    topic = EmergencyStopTopic(peer.node, lambda: None)
+    peer.publisher(Bool, "/emergency_stop", PROFILES["latched"]).publish(Bool())
+    wait_for(lambda: topic._latching() and topic._last)
+    for pressed in (False, True, False):
+        topic._take_latched(Bool(data=pressed), {"publication_sequence_number": None})
+    assert "is still true" in topic.held()
+    wait_for(lambda: topic.held() is None, what="their answers")
 
 
 def test_a_true_that_is_not_latched_does_not_hold_the_stop(loop):

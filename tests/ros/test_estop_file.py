@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from physai.ros import estop_file
 from physai.ros.estop_file import EmergencyStopFile
 from tests.ros.loop import FAR, closed_loop
 from tests.ros.peer import wait_for
@@ -83,6 +84,20 @@ def test_a_disk_that_refuses_is_told_of_and_asked_again(home):
     home.unlink()
     wait_for(lambda: file.path.exists() and not file.failure)
     closed(file)
+
+
+def test_a_change_that_half_succeeded_is_made_again(home, monkeypatch):
+    file = EmergencyStopFile(NODE, 7)
+    file.remember()
+    wait_for(lambda: file._synced)
+    sync = estop_file._sync
+    monkeypatch.setattr(estop_file, "_sync", lambda folder: (_ for _ in ()).throw(OSError(5, "Input/output error")))
+    file.forget()
+    wait_for(lambda: file.failures)
+    monkeypatch.setattr(estop_file, "_sync", sync)
+    file.remember()  # the file has gone, and nobody knows whether for good
+    closed(file)
+    assert file.path.exists()
 
 
 def test_a_disk_that_stands_still_keeps_nobody_waiting(home, monkeypatch):

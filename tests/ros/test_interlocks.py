@@ -92,18 +92,34 @@ def test_nothing_moves_without_a_controller_that_listens(policy_path):
             peer.close()
 
 
+@pytest.mark.fault(
+    "commands do not reach the robot (no controller listens, the watchdog is silent) for longer than "
+    "`resume_timeout` (1 s)"
+)
 def test_a_controller_that_leaves_and_returns_stops_the_arm_in_between(policy_path):
     with free_domain() as domain:
         peer = Peer(domain, listen_to_commands=False)
         try:
-            with closed_loop(policy_path, peer=peer, goal=GOAL) as loop:
-                for _ in range(2):
-                    listener = peer.listen(
+            with closed_loop(policy_path, peer=peer, goal=GOAL, resume_timeout=10.0) as loop:
+
+                def listen():
+                    return peer.listen(
                         Float64MultiArray, TOPIC, peer.commands, 1000, lambda message: message.data.tolist()
                     )
+
+                for _ in range(2):
+                    listener = listen()
                     peer.moved(after=time.monotonic())
                     peer.node.destroy_subscription(listener)
                     waits_because_of(loop, f"no controller listens to {TOPIC}")
+                # One that was away for longer may have been switched off, and the arm led elsewhere.
+                peer.set_parameters("/inference_node", resume_timeout=0.5)
+                loop.node.says("goal forgotten: commands have not reached the robot for 0.5 s")
+                since = time.monotonic()
+                listen()
+                wait_for(lambda: loop.diagnosis()[1].endswith("no goal yet"), what="a wait for a goal")
+                peer.all_zeros(after=since, commands=30)
+                loop.start_from_here()
         finally:
             peer.close()
 

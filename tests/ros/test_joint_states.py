@@ -13,6 +13,7 @@ from rclpy.qos import QoSProfile
 from sensor_msgs.msg import JointState
 
 from physai.ros import qos
+from physai.ros.joint_states import JointStates, Publishers
 from tests.ros.loop import Arm, closed_loop
 from tests.ros.peer import wait_for
 
@@ -200,6 +201,23 @@ def test_of_an_arm_far_beyond_its_limit_are_a_fault_until_it_is_back_and_reset(l
 
 
 # In parts, beside those of others, and by two publishers.
+
+
+def test_of_a_publisher_that_counts_far_ahead_are_those_of_another():
+    publishers, joints = Publishers(), frozenset({"joint1", "joint2"})
+    first = publishers.source(joints, 1000, 0.0)
+    assert publishers.source(joints, 1060, 0.02) == first  # some were lost
+    assert publishers.source(joints, 5000, 0.5) != first
+    assert publishers.contested(0.5) is None
+
+
+def test_are_handed_on_in_the_order_in_which_they_came(peer):
+    states, number = JointStates(peer.node, ["a", "b"], lambda: None), itertools.count(1)
+    for stamp, names in ((1, ["a", "b"]), (2, ["b", "a"]), (3, ["a", "b"])):
+        message = JointState(name=names, position=[0.0, 0.0])
+        message.header.stamp.sec = stamp
+        states._keep(message, {"publication_sequence_number": next(number), "received_timestamp": 0})
+    assert [state.stamp for state in states.take()] == [2, 3]
 
 
 @contextlib.contextmanager

@@ -28,7 +28,8 @@ class Watched:
 
 @pytest.fixture(scope="module")
 def watched(policy_path):
-    with closed_loop(policy_path, watchdog=NAME, max_velocity=0.1) as loop:
+    # However long a busy machine takes until a new watchdog is there.
+    with closed_loop(policy_path, watchdog=NAME, max_velocity=0.1, resume_timeout=10.0) as loop:
         made = Watched(loop)
         yield made
         made.watchdog.end()
