@@ -31,11 +31,10 @@ def leaves_the_arm_standing(peer: Peer) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("batch", range(4))
 @pytest.mark.parametrize(
     ("end", "code"), [(signal.SIGINT, 0), (signal.SIGTERM, 0), ("exception", 1)], ids=["SIGINT", "SIGTERM", "exception"]
 )
-def test_the_last_command_is_zero_five_times_of_five(policy_path, end, code, batch):
+def test_the_last_command_is_zero_five_times_of_five(policy_path, end, code):
     raising = end == "exception"
     module = "tests.ros.raising_node" if raising else "inference_node"
     with contextlib.ExitStack() as stack:
