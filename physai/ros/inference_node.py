@@ -107,8 +107,13 @@ class InferenceNode(StoppableNode):
             self._announce()
         self.get_logger().info(
             f"{config.policy_path} drives {list(policy.metadata.joints)} of '{policy.metadata.robot}', at most "
-            f"{config.max_velocity:g} rad/s; " + ("starting by itself" if self._enabled else "waiting for ~/enable")
+            f"{config.max_velocity:g} rad/s; {self._waits_for()}"
         )
+
+    def _waits_for(self) -> str:
+        if self._stop_file.stopped:
+            return f"stopped until ~/reset ({self._stop_file.path})"
+        return "starting by itself" if self._enabled else "waiting for ~/enable"
 
     def _configure(self, changed: InferenceConfig) -> None:
         self._controller.configure(changed)
@@ -131,11 +136,12 @@ class InferenceNode(StoppableNode):
             self._tick()
             response.success, response.message = True, "disabled: zero velocity"
             return response
-        self._enabled = True
+        permitted, self._enabled = self._enabled, True
         obstacles = self._interlocks(time.monotonic())
         if self._command.state in (State.FAULT, State.ESTOP):
             obstacles.append(f"{self._command.state.value}: call ~/reset first")
-        self._enabled = response.success = not obstacles
+        response.success = not obstacles
+        self._enabled = permitted or response.success  # to refuse is not to take away
         response.message = "; ".join(obstacles) or "enabled"
         return response
 
@@ -154,7 +160,8 @@ class InferenceNode(StoppableNode):
         self._tick()
         self._stop_file.forget()
         response.success = True
-        response.message = "waiting for a new goal" if latched else "nothing to reset"
+        said = "waiting for a new goal" if latched else "nothing to reset"
+        response.message = "; ".join([said, *self._blocked])
         return response
 
     def _shutdown(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
@@ -184,6 +191,7 @@ class InferenceNode(StoppableNode):
         goal, self._goal = self._goal, None
         command = self._controller.update(now, self._robot.take(), goal, interlocks)
         self._publish(command)
+        self._forget_old_goal(now)
         before, self._command = self._command, command
         if goal is not None:
             self.get_logger().info(f"goal ({goal.position[0]:g}, {goal.position[1]:g}) m, in '{goal.frame}'")
@@ -219,16 +227,17 @@ class InferenceNode(StoppableNode):
             self._publishing = True
         if silence is None and unheard is None:
             self._arrived = now
-        elif self._publishing and now - self._arrived > self._controller.config.resume_timeout:
-            self._give_up_goal(f"commands have not reached the robot for {self._controller.config.resume_timeout:g} s")
         return found
 
-    def _give_up_goal(self, why: str) -> None:
-        """Who takes the arm elsewhere meanwhile does not expect it to go on by itself."""
+    def _forget_old_goal(self, now: float) -> None:
+        """Who takes the arm elsewhere while no command reaches it does not expect it to go on by itself."""
+        longest = self._controller.config.resume_timeout
+        if not self._publishing or now - self._arrived <= longest:
+            return
         forgotten = self._controller.forget_goal() or self._goal is not None
         self._goal = None
         if forgotten:
-            self.get_logger().warning(f"goal forgotten: {why}")
+            self.get_logger().warning(f"goal forgotten: commands have not reached the robot for {longest:g} s")
 
     def _publish(self, command: Command) -> None:
         # A disabled node does not disturb another one, once it stands still, and unless there is an emergency.

@@ -52,7 +52,7 @@ class WatchedCommands(VelocityCommands):
         """That the watchdog does not answer at a time, s; or None."""
         before, self._answering = self._answering, now - self._last <= self.timeout
         self.silences += before and not self._answering
-        return None if self._answering else f"the watchdog {self._name} does not answer"
+        return None if self._answering else f"the watchdog {self._name} does not answer, or waits for its ~/reset"
 
     def send(self, velocity: Sequence[float]) -> None:
         """Publish a command; while the watchdog does not answer, zeros past it first."""

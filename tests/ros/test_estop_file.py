@@ -130,6 +130,8 @@ def test_a_node_killed_in_an_emergency_stop_is_in_it_when_it_starts_again(policy
         wait_for(lambda: len(peer.commands) > 180)  # longer than it looks for others
         assert not any(any(velocity) for _, velocity in peer.commands)
         assert {state for _, state in peer.states} == {"estop"}
+        loop.node.says("stopped until ~/reset (")
+        assert not peer.enable().success  # which takes no permission away
         assert peer.call("/inference_node/reset").success
         peer.wait_state("waiting")
         peer.send_goal(*FAR)

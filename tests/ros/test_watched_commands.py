@@ -90,6 +90,12 @@ def test_a_third_commander_is_a_rival_of_both(watched):
         watched.peer.all_zeros(after=time.monotonic())
     finally:
         other.close()
+    # As long as the watchdog passes nothing on, a goal is no reason to find that the arm does not follow.
+    wait_for(lambda: f"{SILENT}, or waits for its ~/reset" in watched.loop.diagnosis()[1])
+    since = time.monotonic()
+    watched.peer.send_goal(*FAR)
+    watched.peer.all_zeros(after=since, commands=50)
+    assert "fault" not in {state for at, state in watched.peer.states if at > since}
     wait_for(lambda: watched.peer.call(f"{NAME}/reset").success)
     drive(watched)
 
