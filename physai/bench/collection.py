@@ -65,7 +65,7 @@ def _collection_speeds(config: TrainConfig, robots: int) -> list[float]:
     spec = RobotSpec.from_config(config.env.robot)
     # Like an untrained policy's, the commands change all the time: a settled motor is cheaper to solve.
     shape = (STEPS_PER_ROUND, robots, len(spec.joints))
-    commands = config.env.max_velocity * np.random.default_rng(config.seed).uniform(-1, 1, shape)
+    commands = spec.command_limit * np.random.default_rng(config.seed).uniform(-1, 1, shape)
     with (
         bare_loop(spec, config.env.control_dt, commands) as bare,
         _collection(config, robots, processes=1) as one,

@@ -14,7 +14,6 @@ from physai.envs.simulation import EnvConfig, Simulation
 from physai.physics import RandomizationConfig
 from physai.seeding import derive
 from physai.transforms import (
-    ActuatorDelay,
     DomainRandomization,
     Memory,
     Observation,
@@ -84,13 +83,13 @@ class TransformedRobotEnv(TransformedEnv):
     def state(self) -> dict[str, dict[str, Tensor]]:
         """Return the state of robots, episodes, transforms and random numbers."""
         return {
-            "simulation": self.simulation.state(),
+            "simulation": self.simulation.snapshot(),
             "transforms": {k: v.clone() for k, v in self.transform.state_dict().items()},
         }
 
     def set_state(self, state: dict[str, dict[str, Tensor]]) -> None:
         """Restore what ``state`` returned, in an env made from the same config."""
-        self.simulation.set_state(state["simulation"])
+        self.simulation.restore(state["simulation"])
         self.transform.load_state_dict(state["transforms"])
 
 
@@ -114,15 +113,12 @@ def make_env(
     """
     base = RobotEnv(env, num_envs)
     layout = base.simulation.layout
-    joints = len(base.simulation.spec.joints)
     transforms: list[Transform] = []
     if randomization.draws:
         transforms.append(DomainRandomization(randomization, layout, num_envs, 0))
-    if randomization.max_delay:
-        transforms.append(ActuatorDelay(layout, num_envs, joints, randomization.max_delay))
     if randomization.affects("encoder_offset", "position_noise", "velocity_noise"):
         transforms.append(SensorModel(layout, 0))
-    transforms.append(Observation(base.simulation.observation))
+    transforms.append(Observation(base.simulation.task.module))
     made = TransformedRobotEnv(base, Compose(*transforms))
     size = made.observation_spec["observation"].shape[-1]
     made.append_transform(ObservationNormalization(size, normalization.eps, normalization.clip))
@@ -141,7 +137,7 @@ def make(
         name: A file of ``conf/env``.
         num_envs: N.
         seed: Seeds every source of randomness in the env.
-        overrides: Hydra overrides such as ``randomization=strong`` or ``env.max_velocity=1.0``.
+        overrides: Hydra overrides such as ``randomization=strong`` or ``env.task.max_steps=100``.
 
     Raises:
         UserError: If an override is wrong; the message names the nearest right one.

@@ -91,7 +91,7 @@ def _run(
     stop: Sequence[int],
 ) -> None:
     judge = _Judge(config)
-    log = RunLog(run_dir, partial(make_logger, config, run_dir), logged)
+    log = RunLog(run_dir, agent.env.simulation.reward_terms, partial(make_logger, config, run_dir), logged)
     progress = Progress(config.total_frames, clock.frames)
     try:
         if not clock.frames:

@@ -69,6 +69,9 @@ def run_training(
         except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
             raise UserError(f"{done}: the run's summary is damaged") from None
         return summary
+    agent = agent or Agent.build(config)
+    for name in config.randomization.without_effect(agent.env.simulation.layout):
+        print(f"randomization.{name} has no effect: it scales what is zero in '{config.env.robot.name}'")
     with stop_signals() as stop:
         agent, clock = train(config, run_dir, resume, stop, agent)
         print(f"Judging the best policy on {config.evaluation.episodes:,} goals it has never seen ...", flush=True)
@@ -121,9 +124,10 @@ class TrainedPolicy:
         self.config = config or load_config(run_dir)
         own = self.config.evaluation.randomization
         if env is not None:
-            trained, given = self.config.env.robot.joints, env.robot.joints
-            if given != trained:
-                raise UserError(f"env '{env.name}' has the joints {given}, the run's policy drives {trained}")
+            for what in ("joints", "command"):
+                trained, given = getattr(self.config.env.robot, what), getattr(env.robot, what)
+                if given != trained:
+                    raise UserError(f"env '{env.name}' has the {what} {given}, the run's policy drives {trained}")
             self.config = self.config.model_copy(update={"env": env})
             own = own if env.simulated else RandomizationConfig.none()
         self.randomization = randomization or own
@@ -183,7 +187,7 @@ def print_summary(summary: dict[str, Any], title: str) -> None:
     rows = {
         "success rate": f"{summary['success_rate']:.1%}   (95 % interval {low:.1%} to {high:.1%})",
         "steps to goal": "none reached" if steps is None else f"{steps:.1f}",
-        "final distance": f"{summary['final_distance'] * 100:.1f} cm",
+        "final distance": f"{summary['final_distance']:.3f} {summary['distance_unit']}",
         "return": f"{summary['return']:.2f}",
         "randomization": summary["randomization"],
     }
