@@ -10,11 +10,8 @@ from filelock import FileLock
 from hypothesis import HealthCheck, settings
 from omegaconf import OmegaConf
 
-from physai.artifact import export_policy
 from physai.config import compose, conf_dir, validate
 from physai.envs.simulation import EnvConfig
-from physai.training.config import TrainConfig
-from physai.training.run import run_training
 
 # A shell that starts the tests in the background has them, and whatever they start, take no notice of Ctrl-C.
 signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -74,6 +71,10 @@ def recurrent_run(tmp_path_factory: pytest.TempPathFactory, worker_id: str) -> P
 
 
 def _run_once(factory: pytest.TempPathFactory, worker_id: str, name: str, *overrides: str) -> Path:
+    from physai.artifact import export_policy  # most tests need no training, and wait for no import of it
+    from physai.training.config import TrainConfig
+    from physai.training.run import run_training
+
     base = factory.getbasetemp()
     shared = base if worker_id == "master" else base.parent  # of all workers: one of them trains, the others wait
     run = shared / name
