@@ -5,17 +5,26 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy import stats
 
 from physai.envs.simulation import Simulation
 from physai.errors import UserError
+from physai.physics import RobotState
 from physai.robots import ForwardKinematics, RobotSpec
-from physai.tasks import Reach
+from physai.signals import Quantity, Ring, Tolerance
+from physai.tasks import Reach, Step
+
+RADII = [0.3, 0.53]
+
+
+def reach(config, goal_radius=RADII) -> Reach:
+    """The task of an env's robot."""
+    spec = RobotSpec.from_config(config.robot)
+    return Reach(spec, ForwardKinematics(spec), goal_radius, tolerance=0.05, success_reward=10.0, max_steps=200)
 
 
 @pytest.fixture
-def task():
-    return Reach([0.3, 0.53], tolerance=0.05, success_reward=10.0, max_steps=200, start_spread=[3.1, 2.5])
+def task(reacher):
+    return reach(reacher)
 
 
 @pytest.fixture
@@ -36,82 +45,73 @@ def simulate(env_config):
 @pytest.fixture(scope="module")
 def turning(reacher):
     """What an arm whose first joint is continuous, and whose second is not, observes."""
-    spec = RobotSpec.from_config(reacher.robot)
-    return Reach([0.3, 0.53], 0.05, 10.0, 200, [3.1, 2.5]).observation(spec, ForwardKinematics(spec))
+    return reach(reacher).module
+
+
+def end_effector(simulation):
+    """Where the end effectors are in the plane, m, [N, 2]."""
+    return simulation.kinematics(torch.from_numpy(simulation.state.joint_position).float())[:, :2].double().numpy()
 
 
 def put_goal_at_the_tip(simulation, row):
     simulation.goal = simulation.goal.copy()
-    simulation.goal[row] = simulation.end_effector[row]
+    simulation.goal[row] = end_effector(simulation)[row]
 
 
-def test_goals_lie_in_the_ring_at_a_uniform_angle_and_radius(task):
-    goals = task.sample_goal(5000, torch.Generator().manual_seed(0)).astype(float)
-    radius = np.linalg.norm(goals, axis=1)
-    angle = np.arctan2(goals[:, 1], goals[:, 0]) % (2 * np.pi)
-    assert radius.min() >= 0.3 - 1e-6
-    assert radius.max() <= 0.53 + 1e-6
-    assert stats.kstest(angle, stats.uniform(0, 2 * np.pi).cdf).pvalue > 0.01
-    assert stats.kstest(radius, stats.uniform(0.3, 0.23).cdf).pvalue > 0.01
-    assert abs(stats.spearmanr(angle, radius).statistic) < 0.05
+def judged(task, distance):
+    """A step that led robots to these distances, m, of the goal."""
+    error = np.reshape(distance, (-1, 1))
+    rows = len(error)
+    state = RobotState(np.zeros((rows, 2)), np.zeros((rows, 2)))
+    held = 0.02 * (error[:, 0] < task.tolerances[0].value)
+    step = Step(state, np.zeros((rows, 2)), np.zeros((rows, 2)), error, held)
+    success = task.success(step)
+    return success, task.terminated(step, success), task.rewards(step, success)
 
 
 def test_the_kuka_s_goals_lie_between_30_and_60_cm(simulate):
     simulation = simulate(name="kuka_reacher", robots=1)
-    radius = np.linalg.norm(simulation.task.sample_goal(1000, torch.Generator().manual_seed(0)), axis=1)
+    radius = np.linalg.norm(simulation.task.region.sample(1000, torch.Generator().manual_seed(0)), axis=1)
     assert 0.3 - 1e-6 <= radius.min() < 0.31
     assert 0.59 < radius.max() <= 0.6 + 1e-6
 
 
-def test_goals_and_starts_follow_the_generator(task, reacher):
-    spec = RobotSpec.from_config(reacher.robot)
-    for sample in (task.sample_goal, lambda rows, generator: task.sample_start(rows, spec, generator)):
-        first, again, other = (sample(16, torch.Generator().manual_seed(seed)) for seed in (1, 1, 2))
-        np.testing.assert_array_equal(first, again)
-        assert not np.isclose(first, other).any()
+def test_it_declares_its_goal_its_region_and_what_it_counts_as_near(task, reacher):
+    assert task.region == Ring(0.3, 0.53)
+    assert (task.goal.name, task.goal.quantity, task.goal.shape) == ("goal", Quantity.POSITION, (2,))
+    assert (task.goal.labels, task.goal.frame, task.goal.unit) == (("x", "y"), "base", "m")
+    np.testing.assert_array_equal(task.goal.bounds, [[-0.53, -0.53], [0.53, 0.53]])
+    assert task.tolerances == (Tolerance("distance", "m", 0.05),)
 
 
-def test_starts_are_uniform_around_home_and_stay_within_the_joint_limits(any_env):
-    spec = RobotSpec.from_config(any_env.robot)
-    spread = any_env.task["start_spread"]
-    task = Reach([0.3, 0.5], 0.05, 10.0, 200, spread)
-    starts = task.sample_start(4000, spec, torch.Generator().manual_seed(0))
-    for joint, width in enumerate(spread):
-        expected = stats.uniform(spec.home[joint] - width, 2 * width)
-        assert stats.kstest(starts[:, joint], expected.cdf).pvalue > 0.01
-    wide = Reach([0.3, 0.5], 0.05, 10.0, 200, [100.0, 100.0])
-    starts = wide.sample_start(100, spec, torch.Generator().manual_seed(0))
-    assert (starts >= spec.position_limit[:, 0]).all()
-    assert (starts <= spec.position_limit[:, 1]).all()
-
-
-def test_distance_counts_in_the_plane_only(task, kuka_reacher):
-    spec = RobotSpec.from_config(kuka_reacher.robot)
-    kinematics = ForwardKinematics(spec)
+def test_distance_counts_in_the_plane_only(kuka_reacher):
+    kinematics = ForwardKinematics(RobotSpec.from_config(kuka_reacher.robot))
     q = torch.tensor([[0.0, 0.5], [1.0, -0.8]])
     end_effector = kinematics(q)
     assert (end_effector[:, 2] > 0.5).all()
     goal = end_effector[:, :2] + torch.tensor([[0.3, 0.4], [-0.6, 0.8]])
-    torch.testing.assert_close(task.observation(spec, kinematics).distance(q, goal), torch.tensor([[0.5], [1.0]]))
+    task = reach(kuka_reacher)
+    torch.testing.assert_close(task.module.error(q, goal), torch.tensor([[0.5], [1.0]]))
+    state = RobotState(q.double().numpy(), np.zeros((2, 2)))
+    np.testing.assert_allclose(task.error(state, goal.double().numpy()), [[0.5], [1.0]], rtol=0, atol=1e-6)
 
 
-def test_reward_and_success_are_the_numbers_of_the_contract(task):
-    distance = np.array([[0.0], [0.03], [0.0499], [0.05], [0.2], [1.08]])
-    success = task.success(distance)
-    assert success[:, 0].tolist() == [True, True, True, False, False, False]
-    expected = [[10.0], [9.97], [9.9501], [-0.05], [-0.2], [-1.08]]
-    np.testing.assert_allclose(task.reward(distance, success), expected)
-    numbers = [[task.reward(d, task.success(d))] for d in distance[:, 0].tolist()]
-    np.testing.assert_array_equal(task.reward(distance, success), numbers)
+def test_rewards_and_success_are_the_numbers_of_the_contract(task):
+    distance = np.array([0.0, 0.03, 0.0499, 0.05, 0.2, 1.08])
+    success, terminated, rewards = judged(task, distance)
+    assert success.tolist() == terminated.tolist() == [True, True, True, False, False, False]
+    assert list(rewards) == ["distance", "success"]
+    np.testing.assert_array_equal(rewards["distance"], -distance)
+    np.testing.assert_array_equal(rewards["success"], [10.0, 10.0, 10.0, 0.0, 0.0, 0.0])
+    np.testing.assert_allclose(sum(rewards.values()), [10.0, 9.97, 9.9501, -0.05, -0.2, -1.08])
 
 
 @pytest.fixture
-def observe(task, env_config):
+def observe(env_config):
     """Make the observation module of an env's robot."""
 
     def make(name="reacher"):
-        spec = RobotSpec.from_config(env_config(name).robot)
-        return task.observation(spec, ForwardKinematics(spec))
+        return reach(env_config(name), [0.3, 0.5]).module
 
     return make
 
@@ -143,16 +143,14 @@ def test_positions_of_joints_with_limits_are_observed_as_they_are(observe):
 
 
 def test_observations_have_finite_bounds_that_hold_after_many_turns(task, reacher):
-    spec = RobotSpec.from_config(reacher.robot)
-    kinematics = ForwardKinematics(spec)
-    lower, upper = task.observation_bounds(spec, kinematics)
-    assert torch.isfinite(lower).all()
-    assert torch.isfinite(upper).all()
+    low, high = task.observation.bounds
+    assert low.shape == high.shape == (8,)
+    assert np.isfinite([low, high]).all()
     q = torch.stack([torch.linspace(-1000, 1000, 5000), torch.linspace(-2.6, 2.6, 5000)], dim=1)
-    observation, _ = task.observation(spec, kinematics)(
-        q, torch.zeros_like(q), torch.from_numpy(task.sample_goal(5000, torch.Generator()))
-    )
-    assert ((lower <= observation) & (observation <= upper)).all()
+    goal = torch.from_numpy(task.region.sample(5000, torch.Generator()))
+    observation = task.module(q, torch.zeros_like(q), goal)[0].numpy()
+    assert ((low <= observation) & (observation <= high)).all()
+    spec = RobotSpec.from_config(reacher.robot)
     assert spec.position_limit[0].tolist() == [-math.inf, math.inf]  # what it says of the robot is left alone
 
 
@@ -164,6 +162,7 @@ def test_the_scripted_observation_equals_eager_bit_for_bit(any_env, observe):
         sensed = [5 * torch.randn(5, 2, generator=generator) for _ in range(3)]
         for ours, theirs in zip(module(*sensed), scripted(*sensed), strict=True):
             assert torch.equal(ours, theirs)
+        assert torch.equal(module.error(sensed[0], sensed[2]), scripted.error(sensed[0], sensed[2]))
 
 
 def test_the_step_that_reaches_the_goal_and_runs_out_of_time_only_terminates(simulate):
@@ -200,31 +199,30 @@ def test_return_and_length_sum_up_since_the_row_s_own_reset(simulate):
         if step == 5:
             simulation.reset(np.array([True, False, False, False]))
     sums = np.stack([sum(rewards[6:])[0], *sum(rewards)[1:]])
-    np.testing.assert_allclose(simulation.episode_return, sums, rtol=1e-5)
+    assert simulation.reward_terms == ("distance", "success")
+    np.testing.assert_allclose(simulation.episode_rewards.sum(axis=1, keepdims=True), sums, rtol=1e-5)
     assert simulation.episode_length[:, 0].tolist() == [4, 10, 10, 10]
 
 
-def test_an_action_is_a_share_of_the_greatest_velocity_and_is_clamped(simulate):
-    simulation = simulate("env.task.start_spread=[0,0]")
+def test_an_action_is_a_share_of_the_command_limit_and_is_clamped(simulate):
+    simulation = simulate("env.start.spread=[0,0]")
     action = np.array([[0.5, 0.0], [1.0, 0.0], [3.0, 0.0], [-7.0, 0.0]])
     for _ in range(30):
         simulation.step(action)
-    np.testing.assert_allclose(simulation.joint_velocity[:, 0], [1.0, 2.0, 2.0, -2.0], rtol=0, atol=0.02)
+    np.testing.assert_allclose(simulation.state.joint_velocity[:, 0], [1.0, 2.0, 2.0, -2.0], rtol=0, atol=0.02)
 
 
 def put(simulation, joint_position, joint_velocity, goal):
     """Bring all robots into a state; numbers that a float32 can hold, for that is what a policy gets."""
-    simulation.goal = np.array(goal, np.float32)
-    rows = np.arange(simulation.num_envs)
-    simulation.physics.reset(
-        rows, *(np.array(value, np.float32).astype(float) for value in (joint_position, joint_velocity))
-    )
-    simulation.set_state(simulation.state())
+    simulation.goal = np.array(goal, np.float32).astype(float)
+    state = RobotState(*(np.array(value, np.float32).astype(float) for value in (joint_position, joint_velocity)))
+    simulation.physics.reset(np.arange(simulation.num_envs), state)
+    simulation.restore(simulation.snapshot())
 
 
 def what_a_policy_sees(simulation):
-    state = simulation.joint_position, simulation.joint_velocity, simulation.goal
-    return simulation.observation(*(torch.from_numpy(value) for value in state))[0].numpy()
+    sensed = simulation.state.joint_position, simulation.state.joint_velocity, simulation.goal
+    return simulation.task.module(*(torch.from_numpy(value).float() for value in sensed))[0].numpy()
 
 
 def assert_same_observation(found, expected, continuous):
@@ -255,41 +253,9 @@ def test_what_a_simulation_observes_is_what_a_policy_sees(both, joint_position, 
         found = simulation.observe()
         assert found.dtype == np.float32
         assert_same_observation(found, what_a_policy_sees(simulation), simulation.spec.continuous)
-        distance = simulation.observation.distance(*map(torch.from_numpy, (simulation.joint_position, simulation.goal)))
-        np.testing.assert_allclose(simulation.distance, distance.numpy(), rtol=0, atol=1e-6)
-
-
-@pytest.mark.parametrize("name", ["reacher", "kuka_reacher"])
-def test_one_robot_in_numbers_does_what_it_does_in_arrays(simulate, name):
-    numbers, arrays = (simulate("env.task.max_steps=40", name=name, robots=1) for _ in range(2))
-    random = np.random.default_rng(0)
-    shares = np.repeat(random.uniform(-2, 2, (20, 2)), 10, axis=0).astype(np.float32)
-    shares[0] = [0.0, np.float32(1.0)]
-    ends = set()
-    for step, action in enumerate(shares):
-        if step == 30:
-            for simulation in (numbers, arrays):
-                put_goal_at_the_tip(simulation, 0)
-        observation, reward, terminated, truncated, info = numbers.step_one(action)
-        rewards, terminations, truncations = arrays.step(action[None])
-        for key, value in arrays.physics.state().items():
-            np.testing.assert_array_equal(numbers.physics.state()[key], value)
-        for key in ("joint_position", "joint_velocity", "episode_length"):
-            np.testing.assert_array_equal(getattr(numbers, key), getattr(arrays, key))
-        for key in ("end_effector", "distance", "episode_return"):
-            found, expected = getattr(numbers, key), getattr(arrays, key)
-            assert found.dtype == expected.dtype
-            np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-6)
-        assert_same_observation(observation, arrays.observe()[0], arrays.spec.continuous)
-        assert reward == pytest.approx(rewards.item(), abs=1e-6)
-        assert (terminated, truncated) == (terminations.item(), truncations.item())
-        assert info == {"is_success": terminated, "distance": pytest.approx(arrays.distance.item(), abs=1e-6)}
-        assert all(type(value) is bool for value in (terminated, truncated, info["is_success"]))
-        ends.add((terminated, truncated))
-        if terminated or truncated:
-            numbers.reset()
-            arrays.reset()
-    assert ends == {(False, False), (True, False), (False, True)}
+        pair = simulation.state.joint_position, simulation.goal
+        error = simulation.task.module.error(*(torch.from_numpy(value).float() for value in pair))
+        np.testing.assert_allclose(simulation.error, error.numpy(), rtol=0, atol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -297,8 +263,8 @@ def test_one_robot_in_numbers_does_what_it_does_in_arrays(simulate, name):
     [
         ("env.task.goal_radius=[0.5,0.3]", ["env.task.goal_radius", "0.5", "0.3"]),
         ("env.task.goal_radius=[0.3,0.9]", ["env.task.goal_radius", "0.9", "reach", "planar_arm"]),
-        ("env.task.start_spread=[1.0]", ["env.task.start_spread", "2 joints"]),
-        ("env.max_velocity=3.0", ["env.max_velocity", "3.0", "2.5"]),
+        ("env.start.spread=[1.0]", ["env.start.spread", "2 joints"]),
+        ("env.robot.command_limit=[2.0,3.0]", ["command_limit", "3", "joint2", "2.5"]),
     ],
 )
 def test_a_task_that_the_robot_cannot_do_is_refused(env_config, override, words):
