@@ -11,6 +11,7 @@ from gymnasium.vector import AutoresetMode
 from stable_baselines3.common.env_checker import check_env as check_env_sb3
 
 import physai
+from physai.envs.viewing import make_viewer
 from physai.errors import UserError
 
 IDS = ["physai/Reacher-v0", "physai/KukaReacher-v0"]
@@ -88,7 +89,7 @@ def test_one_env_and_the_torchrl_env_play_the_same_episode(make):
     batched = physai.make_env("reacher", 1, overrides=["randomization=none"])
     env.reset(seed=0)
     batched.reset()
-    batched.simulation.set_state(env.unwrapped.simulation.state())
+    batched.simulation.restore(env.unwrapped.simulation.snapshot())
     td = batched.base_env.fake_tensordict()
     random = np.random.default_rng(0)
     for _ in range(50):
@@ -103,12 +104,13 @@ def test_one_env_and_the_torchrl_env_play_the_same_episode(make):
     batched.close()
 
 
-def test_info_tells_success_and_distance(make):
+def test_info_tells_success_and_the_task_s_errors_by_name(make):
     env = make(IDS[0])
     observation, info = env.reset(seed=0)
+    assert set(info) == {"is_success", "distance"}
     assert info["is_success"] is False
     assert info["distance"] == pytest.approx(np.linalg.norm(observation[4:6] - observation[6:8]), abs=1e-6)
-    env.unwrapped.simulation.goal = observation[None, 4:6].copy()
+    env.unwrapped.simulation.goal = observation[None, 4:6].astype(float)
     _, reward, terminated, truncated, info = env.step(np.zeros(2, np.float32))
     assert (terminated, truncated, info["is_success"]) == (True, False, True)
     assert reward == pytest.approx(10.0 - info["distance"])
@@ -153,6 +155,8 @@ def test_a_vector_env_restarts_an_episode_at_the_step_after_its_end(make, name):
     assert (rewards[1][[0, 2, 3]] < 0).all()
     assert rewards[5][[0, 2, 3]].tolist() == [0, 0, 0]
     assert infos[0]["is_success"].tolist() == second
+    assert set(info) == {"is_success", "distance"}
+    assert info["distance"].shape == (4,)
     np.testing.assert_array_equal(observations[0][1, 6:], first[1, 4:6])  # the last observation of the old episode
     assert (observations[1][1, 6:] != observations[0][1, 6:]).all()  # the first of the new one
     assert (observations[1][1, 2:4] == 0).all()  # the action was not applied
@@ -191,7 +195,7 @@ def test_the_picture_shows_the_goal_where_it_is(make, name):
     simulation = env.unwrapped.simulation
     centres = []
     for goal in ([0.4, 0.0], [0.0, 0.4], [-0.4, 0.0]):
-        simulation.goal = np.array([goal], np.float32)
+        simulation.goal = np.array([goal])
         image = env.render()
         assert image.dtype == np.uint8
         assert image.shape == (360, 480, 3)
@@ -214,31 +218,6 @@ def test_looking_does_not_disturb_the_simulation(make):
             env.render()
         seen.append(steps)
     np.testing.assert_array_equal(*seen)
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="cores are taken away as Linux does it")
-def test_a_vector_env_keeps_as_many_cores_busy_as_have_32_robots_to_move_if_it_is_not_told_otherwise():
-    in_fresh_python(
-        "import os, gymnasium, physai\n"
-        "from concurrent.futures import ThreadPoolExecutor\n"
-        "from multiprocessing import active_children\n"
-        "def others(num_envs, **options):\n"
-        "    envs = gymnasium.make_vec('physai/Reacher-v0', num_envs, 'vector_entry_point', **options)\n"
-        "    count = len(active_children())\n"
-        "    envs.close()\n"
-        "    return count\n"
-        "assert others(63) == others(64, processes=1) == 0\n"
-        "assert others(64) == min(2, len(os.sched_getaffinity(0))) - 1\n"
-        "assert ThreadPoolExecutor().submit(others, 64).result() == 0\n"  # they would end with the thread
-        "os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})\n"
-        "assert others(64) == 0\n"
-        "assert others(64, processes=2) == 1\n"
-    )
-
-
-def test_a_vector_env_in_no_process_is_refused(make):
-    with pytest.raises(UserError, match="processes"):
-        make(IDS[0], 2, processes=0)
 
 
 def test_a_vector_env_renders_its_first_robot(make):
@@ -266,6 +245,40 @@ def test_a_gymnasium_env_needs_no_torchrl():
         "assert not {'torchrl', 'tensordict'} & set(sys.modules)\n"
         "env.close(); envs.close()\n"
     )
+
+
+def test_nothing_of_a_viewer_is_imported_before_somebody_looks():
+    in_fresh_python(
+        "import sys, gymnasium, physai\n"
+        "physai.make_env('reacher', num_envs=2).rollout(2)\n"
+        "env = gymnasium.make('physai/Reacher-v0', render_mode='rgb_array'); env.reset(seed=0)\n"
+        "assert 'physai.physics.viewer' not in sys.modules\n"
+        "env.render()\n"
+        "assert 'physai.physics.viewer' in sys.modules\n"
+    )
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere there is always a screen")
+def test_a_window_without_a_screen_is_refused_in_one_line_that_says_what_to_do(make, monkeypatch):
+    monkeypatch.delenv("DISPLAY", raising=False)
+    env = make(IDS[0])
+    assert "human" not in env.unwrapped.metadata["render_modes"]
+    with pytest.raises(UserError, match=r"no screen here \(DISPLAY is not set\): render images"):
+        make_viewer(env.unwrapped.simulation, window=True)
+
+
+@pytest.mark.parametrize("num_envs", [None, 3])
+def test_a_robot_that_takes_positions_is_an_env_like_any_other(make, num_envs):
+    env = make(IDS[0], num_envs, overrides=["env.robot.command=joint_position"])
+    observation, _ = env.reset(seed=0)
+    simulation = env.unwrapped.simulation
+    before = simulation.state.joint_position
+    for _ in range(20):
+        observation = env.step(np.full(env.action_space.shape, 0.5, np.float32))[0]
+    assert env.observation_space.contains(observation)
+    speed = simulation.state.joint_velocity[:, 0]
+    np.testing.assert_allclose(speed, 0.5 * simulation.spec.command_limit[0], rtol=0.1)
+    assert (simulation.state.joint_position[:, 0] > before[:, 0]).all()
 
 
 def test_gymnasium_finds_the_env_by_the_module_in_its_name():

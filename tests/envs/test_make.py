@@ -1,3 +1,5 @@
+from operator import attrgetter
+
 import numpy as np
 import pytest
 import torch
@@ -9,6 +11,7 @@ import physai
 from physai.envs.robot_env import RobotEnv
 from physai.errors import UserError
 
+KEPT = ("goal", "episode_rewards", "error", "last_command", "within", "physics_parameters")
 NAMES = ["reacher", "kuka_reacher"]
 RANDOMIZATIONS = ["none", "default", "strong"]
 every_env = [pytest.mark.parametrize("name", NAMES), pytest.mark.parametrize("randomization", RANDOMIZATIONS)]
@@ -86,9 +89,12 @@ def test_a_partial_reset_leaves_the_other_rows_of_all_keys_bit_identical(make_en
     for key in ("joint_position", "goal", "observation"):
         assert (after[key][rows] != before[key][rows]).any(-1).all(), key
     assert (after["episode_length"][rows] == 0).all()
-    assert (after["episode_return"][rows] == 0).all()
+    assert (after["episode_rewards"][rows] == 0).all()
     for key, value in env.state()["simulation"].items():
-        if key != "generator":
+        if key == "delay.commands":  # has room for the longest delay of all: its first axis is time
+            count = len(state[key])
+            assert torch.equal(value[:count, ~rows], state[key][:, ~rows])
+        elif key != "generator":
             assert torch.equal(value[~rows], state[key][~rows]), key
 
 
@@ -105,8 +111,8 @@ def test_rows_that_were_never_reset_go_the_same_way_whatever_happens_to_the_othe
             td = disturbed.reset(td.set("_reset", mask))
         td = disturbed.step(td.set("action", action))["next"]
         quiet_td = quiet.step(quiet_td.set("action", action))["next"]
-        for key in ("joint_position", "joint_velocity", "goal", "episode_return", "distance", "physics_parameters"):
-            ours, theirs = (getattr(env.simulation, key)[kept.numpy()] for env in (disturbed, quiet))
+        for key in ("state.joint_position", "state.joint_velocity", *KEPT):
+            ours, theirs = (attrgetter(key)(env.simulation)[kept.numpy()] for env in (disturbed, quiet))
             np.testing.assert_array_equal(ours, theirs, err_msg=f"{step} {key}")
         assert torch.equal(td["reward"][kept], quiet_td["reward"][kept])
 
@@ -137,8 +143,13 @@ def test_a_rollout_of_staggered_episodes_is_consistent(make_env, name, randomiza
     assert torch.equal(seen["next", "truncated"], (seen["next", "episode_length"] == 13) & ~seen["next", "terminated"])
     assert not torch.isclose(follows["goal"][over], seen["goal"][:, :-1][over]).all(-1).any()
     torch.testing.assert_close(
-        seen["next", "episode_return"], seen["episode_return"] + seen["next", "reward"], rtol=0, atol=1e-6
+        seen["next", "episode_rewards"].sum(-1, keepdim=True),
+        seen["episode_rewards"].sum(-1, keepdim=True) + seen["next", "reward"],
+        rtol=0,
+        atol=1e-4,
     )
+    assert torch.equal(seen["next", "success"], seen["next", "terminated"])  # a reached goal ends the episode
+    assert not seen["success"].any()
 
 
 def test_an_episode_is_truncated_after_200_steps(make_env):
@@ -180,10 +191,12 @@ def test_the_global_random_numbers_of_torch_play_no_part(make_env):
     assert_equal(rollouts[0], rollouts[1])
 
 
-@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("command", ["joint_velocity", "joint_position"])
 @parametrized
-def test_a_restored_state_continues_bit_for_bit_with_noise_and_delay(make_env, name, randomization, seed):
-    options = {"overrides": ["env.task.max_steps=40", "env.task.tolerance=0.1"]}
+def test_a_restored_state_continues_bit_for_bit_with_noise_and_delay(make_env, name, randomization, command):
+    driven = [f"env.robot.command={command}", "env.start.carried_over=0.5"]
+    options = {"overrides": ["env.task.max_steps=40", "env.task.tolerance=0.1", *driven]}
+    seed = 1
     original = make_env(name, randomization, seed=seed, **options)
     seen, td = play(original, original.reset(), 45)
     original.normalization.update(seen["observation"])
@@ -217,13 +230,13 @@ def test_a_state_that_was_taken_can_be_gone_back_to_after_any_detour(make_env):
 
 
 def test_a_seed_gives_the_same_goals_to_robots_one_after_the_other_as_side_by_side(make_env):
-    home = {"randomization": "none", "overrides": ["env.task.start_spread=[0.0,0.0]"]}
+    home = {"randomization": "none", "overrides": ["env.start.spread=[0.0,0.0]"]}
     together, alone = make_env(num_envs=50, **home), make_env(num_envs=1, **home)
     for env in (together, alone):
         env.set_seed(3)
     goals = together.reset()["goal"]
     assert torch.equal(goals, torch.cat([alone.reset()["goal"] for _ in range(50)]))
-    assert not together.simulation.joint_position.any()
+    assert not together.simulation.state.joint_position.any()
 
 
 def test_make_env_works_as_the_readme_shows():
@@ -241,11 +254,14 @@ def test_make_env_works_as_the_readme_shows():
     ("override", "words"),
     [
         ("randomization=stron", ["stron", "did you mean 'strong'?"]),
-        ("env.max_velocty=1.0", ["env.max_velocty", "did you mean 'env.max_velocity'?"]),
+        ("env.control_td=0.01", ["env.control_td", "did you mean 'env.control_dt'?"]),
+        ("env.start.spraed=[1,1]", ["env.start.spraed", "did you mean 'env.start.spread'?"]),
         ("env.task.tolerence=0.1", ["env.task.tolerence", "did you mean 'env.task.tolerance'?"]),
         ("randomisation=none", ["randomisation", "did you mean 'randomization'?"]),
-        ("env.max_velocity=fast", ["max_velocity", "number", "'fast'"]),
-        ("env.max_velocity=-1.0", ["max_velocity", "greater than 0", "-1.0"]),
+        ("env.control_dt=fast", ["control_dt", "number", "'fast'"]),
+        ("env.control_dt=-1.0", ["control_dt", "greater than 0", "-1.0"]),
+        ("env.start.carried_over=1.5", ["start.carried_over", "less than or equal to 1", "1.5"]),
+        ("env.start.spread=[-1.0,1.0]", ["start.spread.0", "greater than or equal to 0", "-1.0"]),
         ("env.task.max_steps=0", ["max_steps", "greater than 0", "0"]),
         ("env.robot.joints=[joint1,joint3]", ["joint3", "did you mean 'joint"]),
         ("normalization.clip=0", ["clip", "greater than 0"]),
