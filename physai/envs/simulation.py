@@ -17,7 +17,7 @@ from physai.tasks import Step, Task
 
 _TASK = ("goal", "region", "tolerances", "module", "max_steps", "success", "terminated", "rewards")
 _PHYSICS = ("reset", "step", "robot_state", "close")
-_STATE = ("goal", "last_command", "episode_length", "episode_rewards", "physics_parameters", "within")
+_STATE = ("goal", "last_command", "episode_length", "episode_rewards", "physics_parameters", "within", "success")
 
 
 def _says_whether_simulated(node: dict[str, Any]) -> dict[str, Any]:
