@@ -64,6 +64,16 @@ def test_every_choice_builds_and_collects(overrides):
     agent.close()
 
 
+@pytest.mark.parametrize("robot", choices("robot"))
+@pytest.mark.parametrize("command", ["joint_velocity", "joint_position"])
+def test_every_robot_can_be_driven_by_velocities_and_by_positions(robot, command):
+    agent = Agent.build(small(env_of(robot), f"robot@env.robot={robot}", f"env.robot.command={command}"))
+    batch = next(iter(agent.collector))
+    assert ("last_command" in batch.keys()) == (command == "joint_position")  # noqa: SIM118 (of a TensorDict)
+    agent.algorithm.update(batch)
+    agent.close()
+
+
 def test_sb3_defaults_are_the_well_known_numbers():
     config = validate(TrainConfig, compose("train", ["experiment=sb3_defaults"]))
     algo = config.algo
