@@ -1,6 +1,5 @@
 """Goals from outside: which are taken, and which are not."""
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -8,51 +7,82 @@ import numpy as np
 
 from physai.deploy.joints import to_floats
 from physai.deploy.metadata import Metadata
+from physai.signals import Signal
 
 
 @dataclass(frozen=True)
 class Goal:
-    """Where the end effector shall go.
+    """Where the robot shall go.
 
     Attributes:
-        position: x and y in the frame, m.
-        frame: Name of the frame.
+        value: Its numbers, in the unit and order of the policy's goal.
+        frame: Name of the frame of a position; a goal of joints has none.
+        names: What each number is for, such as a joint; with names, the order is free. Empty: in the policy's order.
     """
 
-    position: Sequence[float]
-    frame: str
+    value: Sequence[float]
+    frame: str = ""
+    names: Sequence[str] = ()
 
 
 class GoalError(Exception):
     """A goal that cannot be taken: ``kind`` for counting, and a line for people."""
 
     def __init__(self, kind: str, message: str) -> None:
-        super().__init__(message)
+        super().__init__(f"goal rejected: {message}")
         self.kind = kind
 
 
-def accept(goal: Goal, metadata: Metadata, project: bool) -> np.ndarray:
-    """Return the goal's position [2], m, moved onto the ring of reachable goals if that is allowed.
+def accept(goal: Goal, metadata: Metadata, project: bool) -> tuple[np.ndarray, bool]:
+    """Check a goal.
+
+    Args:
+        goal: From outside.
+        metadata: Of the policy.
+        project: Whether one out of reach is moved to the nearest in reach.
+
+    Returns:
+        The goal's numbers [g] in the policy's order, and whether they were moved.
 
     Raises:
-        GoalError: If it is not two finite numbers in the right frame, or out of reach.
+        GoalError: If it has not as many finite numbers as the policy's goals, in their frame, or is out of reach.
     """
-    position = to_floats(goal.position) if isinstance(goal, Goal) else None
-    if position is None:
-        raise GoalError("malformed", "goal rejected: it is not two numbers")
-    if position.shape != (2,):
-        raise GoalError("malformed", f"goal rejected: it has the shape {list(position.shape)}, not [2]")
-    radius = math.hypot(*position)
-    if not math.isfinite(radius):
-        raise GoalError("not finite", "goal rejected: it is not finite")
+    signal = metadata.goal
+    value = to_floats(goal.value) if isinstance(goal, Goal) else None
+    if value is None:
+        raise GoalError("malformed", f"it is not {signal.size} numbers")
+    value = _ordered(value, goal.names, signal)
+    if not np.isfinite(value).all():
+        raise GoalError("not finite", "it is not finite")
     if not isinstance(goal.frame, str):
-        raise GoalError("malformed", "goal rejected: its frame is no name")
-    if goal.frame != metadata.goal_frame:
-        raise GoalError("wrong frame", f"goal rejected: frame '{goal.frame}' is not '{metadata.goal_frame}'")
-    inner, outer = metadata.goal_radius
-    # A goal on the very edge, written with fewer digits, is meant to be in.
-    if inner - 1e-6 <= radius <= outer + 1e-6:
-        return position
-    if project and radius > 1e-6:
-        return position * (min(max(radius, inner), outer) / radius)
-    raise GoalError("unreachable", f"goal rejected: {radius:.3f} m from the base, not {inner:g} to {outer:g} m")
+        raise GoalError("malformed", "its frame is no name")
+    if signal.frame and goal.frame != signal.frame:
+        raise GoalError("wrong frame", f"frame '{goal.frame}' is not '{signal.frame}'")
+    if metadata.region.contains(value):
+        return value, False
+    nearest = metadata.region.project(value) if project else None
+    if nearest is None or not metadata.region.contains(nearest):  # the nearest of one too far for floats is nowhere
+        raise GoalError("unreachable", metadata.region.describe(value))
+    return nearest, True
+
+
+def _ordered(value: np.ndarray, names: Sequence[str], signal: Signal) -> np.ndarray:
+    """Bring numbers that are named into the order of the signal."""
+    if isinstance(names, str) or not isinstance(names, Sequence) or not all(isinstance(name, str) for name in names):
+        raise GoalError("malformed", "its names are no list of names")
+    if not names:
+        if value.shape != (signal.size,):
+            raise GoalError("malformed", f"it has the shape {list(value.shape)}, not [{signal.size}]")
+        return value
+    if value.shape != (len(names),):
+        raise GoalError("malformed", f"it has {len(names)} names for numbers of the shape {list(value.shape)}")
+    if len(set(names)) < len(names):
+        raise GoalError("malformed", "it names a number twice")
+    for what, words in (
+        ("does not name", [label for label in signal.labels if label not in names]),
+        ("has no use for", [name for name in names if name not in signal.labels]),
+    ):
+        if words:
+            labels = list(signal.labels)
+            raise GoalError("malformed", f"it {what} {words[0][:80]!r}; the policy's goals are of {labels}")
+    return value[[names.index(label) for label in signal.labels]]

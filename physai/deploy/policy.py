@@ -6,13 +6,13 @@ import os
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, overload
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 
 from physai.deploy import archive
-from physai.deploy.metadata import DISTANCE, INPUTS, OUTPUT, Metadata, PolicyError
+from physai.deploy.metadata import ERROR, GOAL, JOINT_POSITION, Metadata, PolicyError
 
 if TYPE_CHECKING:
     from tensordict.nn import TensorDictModule
@@ -20,20 +20,19 @@ if TYPE_CHECKING:
 Vector = Sequence[float] | np.ndarray
 
 # Golden pairs are equal to the last bit where the processor is the one that recorded them; others round differently.
-GOLDEN_TOLERANCE = 1e-4  # rad/s and m
+GOLDEN_TOLERANCE = 1e-4  # in the SI unit of each
 
 
 class Policy:
-    """From what one robot senses to its joint velocities; of :func:`load_policy`. Not for several threads at once.
+    """From what one robot senses to its next command; of :func:`load_policy`. Not for several threads at once.
 
     A policy that remembers keeps nothing itself: it takes a memory, and gives the memory for the next call.
 
     Attributes:
-        metadata: What the file says about itself.
+        metadata: What the file says about itself: also what goes in and comes out, in order.
         sha256: Hash of the file.
-        golden_error: Largest difference to the recorded commands on this machine, rad/s; 0.0 if all bits agree.
-        module: The TorchScript module, for batches: float32 tensors [N, n], [N, n], [N, 2] to [N, n]; of a policy that
-            remembers, also [N, H] to [N, H].
+        golden_error: Largest difference to the recorded commands on this machine, in their unit; 0.0 if all bits agree.
+        module: The TorchScript module, for batches: float32 tensors [N, *shape] of each input to those of each output.
     """
 
     def __init__(self, module: torch.jit.ScriptModule, metadata: Metadata, sha256: str) -> None:
@@ -41,60 +40,53 @@ class Policy:
         self.metadata = metadata
         self.sha256 = sha256
         self.golden_error = 0.0
-        n = len(metadata.joints)
-        # Each array shares its memory with the tensor beside it: filling it is cheaper than making tensors.
-        arrays = [np.zeros((1, size), np.float32) for size in (n, n, 2, metadata.memory_size)]
-        self._position, self._velocity, self._goal, self._memory = arrays
-        self._tensors = [torch.from_numpy(array) for array in arrays[: len(metadata.inputs)]]
+        # Each row shares its memory with the tensor beside it: filling it is cheaper than making tensors.
+        self._rows = [np.zeros(signal.size, np.float32) for signal in metadata.inputs]
+        pairs = zip(self._rows, metadata.inputs, strict=True)
+        self._tensors = [torch.from_numpy(row).reshape(1, *signal.shape) for row, signal in pairs]
+        names = [signal.name for signal in metadata.inputs]
+        self._position, self._goal = names.index(JOINT_POSITION), names.index(GOAL)
+        self._remembers = len(metadata.outputs) > 1
 
-    @overload
-    def __call__(self, joint_position: Vector, joint_velocity: Vector, goal: Vector) -> np.ndarray: ...
-
-    @overload
-    def __call__(
-        self, joint_position: Vector, joint_velocity: Vector, goal: Vector, memory: Vector
-    ) -> tuple[np.ndarray, np.ndarray]: ...
-
-    def __call__(
-        self, joint_position: Vector, joint_velocity: Vector, goal: Vector, memory: Vector | None = None
-    ) -> np.ndarray | tuple[np.ndarray, np.ndarray]:
-        """Map positions [n] rad, velocities [n] rad/s and a goal [2] m to velocity commands [n], rad/s, float32.
+    def __call__(self, *inputs: Vector) -> np.ndarray | tuple[np.ndarray, np.ndarray]:
+        """Map the inputs, each flat, in the order of ``metadata.inputs``, to a command [n], float32.
 
         A policy that remembers also takes a memory [H], zeros where an episode begins, and gives the new one, [H].
 
         Raises:
             ValueError: If one of them has another length, or is missing.
         """
-        _fill(self._position, joint_position)
-        _fill(self._velocity, joint_velocity)
-        _fill(self._goal, goal)
-        if memory is None and not self.metadata.memory_size:
+        if len(inputs) != len(self._rows):
+            raise ValueError(f"{len(self._rows)} inputs are needed, not {len(inputs)}")
+        for row, values in zip(self._rows, inputs, strict=True):
+            _fill(row, values)
+        if not self._remembers:
             return self.module(*self._tensors)[0].numpy()
-        _fill(self._memory, () if memory is None else memory)
         command, new_memory = self.module(*self._tensors)
         return command[0].numpy(), new_memory[0].numpy()
 
-    def distance(self, joint_position: Vector, goal: Vector) -> float:
-        """Distance of the end effector to a goal [2] m at joint positions [n] rad, in m.
+    def error(self, joint_position: Vector, goal: Vector) -> np.ndarray:
+        """Return how far the robot is from a goal [g] at joint positions [n] rad: [E], as ``metadata.tolerances``.
 
         Raises:
             ValueError: If one of them has another length.
         """
-        _fill(self._position, joint_position)
-        _fill(self._goal, goal)
-        return float(self.module.distance(self._tensors[0], self._tensors[2]))
+        _fill(self._rows[self._position], joint_position)
+        _fill(self._rows[self._goal], goal)
+        return self.module.error(self._tensors[self._position], self._tensors[self._goal])[0].numpy()
 
     def as_tensordict_module(self) -> "TensorDictModule":
         """Wrap the module for TorchRL code, with its keys; needs tensordict."""
         from tensordict.nn import TensorDictModule
 
-        return TensorDictModule(self.module, in_keys=list(self.metadata.inputs), out_keys=list(self.metadata.outputs))
+        keys = [[signal.name for signal in side] for side in (self.metadata.inputs, self.metadata.outputs)]
+        return TensorDictModule(self.module, in_keys=keys[0], out_keys=keys[1])
 
 
 def _fill(row: np.ndarray, values: Vector) -> None:
-    if len(values) != row.shape[1]:  # NumPy would let one value stand for all
-        raise ValueError(f"{row.shape[1]} values are needed, not {len(values)}")
-    row[0] = values
+    if len(values) != len(row):  # NumPy would let one value stand for all
+        raise ValueError(f"{len(row)} values are needed, not {len(values)}")
+    row[:] = values
 
 
 def read_metadata(path: str | Path) -> Metadata:
@@ -139,7 +131,8 @@ def load_policy(path: str | Path, sha256: str | None = None, expect_joints: Sequ
         how = "with its joints in another order" if set(joints) == set(metadata.joints) else "for other joints"
         raise PolicyError(f"{path}: a policy {how}: {list(metadata.joints)}, not {list(joints)}")
     try:
-        policy = Policy(load_module(checked.content, metadata.inputs), metadata, digest)
+        names = [signal.name for signal in metadata.inputs]
+        policy = Policy(load_module(checked.content, names), metadata, digest)
         policy.golden_error = _golden_error(policy)
     except PolicyError as error:
         raise PolicyError(f"{path}: {error}") from None
@@ -166,12 +159,12 @@ def _described(path: Path, checked: archive.Archive) -> Metadata:
     return metadata
 
 
-def load_module(content: bytes, inputs: Sequence[str] = INPUTS) -> torch.jit.ScriptModule:
+def load_module(content: bytes, inputs: Sequence[str]) -> torch.jit.ScriptModule:
     """Load the TorchScript of a policy file that has been checked, or that is not written yet.
 
     Args:
         content: Of the file.
-        inputs: What the policy takes.
+        inputs: Names of what the policy takes, in order.
 
     Raises:
         PolicyError: If its methods are not those of a policy.
@@ -180,38 +173,42 @@ def load_module(content: bytes, inputs: Sequence[str] = INPUTS) -> torch.jit.Scr
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)  # of TorchScript
         module = torch.jit.load(io.BytesIO(content), map_location="cpu").eval()
-        for method, arguments in (("forward", inputs), ("distance", ("joint_position", "goal"))):
+        for method, arguments in (("forward", inputs), (ERROR, (JOINT_POSITION, GOAL))):
             found = [a.name for a in getattr(module, method).schema.arguments[1:]] if hasattr(module, method) else None
             if found != list(arguments):
                 raise PolicyError(f"its {method} takes {found}, not {list(arguments)}")
         held = sorted(v.untyped_storage().nbytes() for v in module.state_dict().values())
         if held != sorted(archive.tensor_sizes(content)):
             raise PolicyError("its weights are shorter or longer than it says")
-        return torch.jit.freeze(module, preserved_attrs=["distance"])
+        return torch.jit.freeze(module, preserved_attrs=[ERROR])
 
 
 def _golden_error(policy: Policy) -> float:
     """Run all pairs, thrice: the first calls also let TorchScript's profiling executor settle."""
-    golden, metadata, worst = policy.metadata.golden, policy.metadata, 0.0
+    metadata, golden, worst = policy.metadata, policy.metadata.golden, 0.0
     pairs = [dict(zip(golden, values, strict=True)) for values in zip(*golden.values(), strict=True)]
     for pair in pairs * 3:
-        inputs = [pair[key] for key in metadata.inputs]
+        inputs = [pair[signal.name] for signal in metadata.inputs]
         answer = policy(*inputs)
-        for key, found in zip(metadata.outputs, answer if metadata.memory_size else (answer,), strict=True):
-            expected = pair[key]
-            if found.shape != expected.shape or found.dtype != np.float32:
-                raise PolicyError(f"it gives {found.dtype} {list(found.shape)}, not float32 {list(expected.shape)}")
-            error = float(np.abs(found - expected).max())
-            if not error <= GOLDEN_TOLERANCE:  # also where it is NaN
-                raise PolicyError(
-                    f"a golden pair differs by {error:.3g}{' rad/s' if key == OUTPUT else f' in {key}'}: at "
-                    f"{_shown(*inputs)} it gives {_shown(found)}, and gave {_shown(expected)} when it was exported"
-                )
-            worst = max(worst, error)
-        gap = abs(policy.distance(pair["joint_position"], pair["goal"]) - pair[DISTANCE][0])
-        if not gap <= GOLDEN_TOLERANCE:
-            raise PolicyError(f"the distance of a golden pair differs by {gap:.3g} m")
+        outputs = answer if isinstance(answer, tuple) else (answer,)
+        for signal, found in zip(metadata.outputs, outputs, strict=True):
+            unit = f" {signal.unit}" if signal is metadata.command else f" in {signal.name}"
+            worst = max(worst, _difference(found, pair[signal.name], unit, inputs))
+        error = policy.error(pair[JOINT_POSITION], pair[GOAL])
+        _difference(error, pair[ERROR], f" in {ERROR}", [pair[JOINT_POSITION], pair[GOAL]])
     return worst
+
+
+def _difference(found: np.ndarray, expected: np.ndarray, what: str, inputs: Sequence[np.ndarray]) -> float:
+    if found.shape != expected.shape or found.dtype != np.float32:
+        raise PolicyError(f"it gives {found.dtype} {list(found.shape)}, not float32 {list(expected.shape)}")
+    difference = float(np.abs(found - expected).max())
+    if not difference <= GOLDEN_TOLERANCE:  # also where it is NaN
+        raise PolicyError(
+            f"a golden pair differs by {difference:.3g}{what}: at {_shown(*inputs)} it gives {_shown(found)}, "
+            f"and gave {_shown(expected)} when it was exported"
+        )
+    return difference
 
 
 def _shown(*arrays: np.ndarray) -> str:
