@@ -13,7 +13,7 @@ from physai.errors import UserError
 _KNOWN = (JOINT_POSITION, JOINT_VELOCITY, GOAL, MEMORY, LAST_COMMAND)
 
 
-class PolicyFailure(Exception):
+class AnswerError(Exception):
     """An answer that is none: ``kind`` for counting, and what the policy did."""
 
     def __init__(self, kind: str, what: str) -> None:
@@ -51,33 +51,33 @@ class CheckedPolicy:
         """Return how far joint positions [n], rad, are from a goal [g]: [E], in the units of the tolerances.
 
         Raises:
-            PolicyFailure: If the policy cannot say.
+            AnswerError: If the policy cannot say.
         """
         self._started = self._stopwatch()
         error = self._call(lambda: np.asarray(self._policy.error(position, goal), dtype=np.float64))
         if error.shape != self._errors or not ((error >= 0) & (error < math.inf)).all():
-            raise PolicyFailure("error", f"gave the error {str(error.tolist())[:80]}")
+            raise AnswerError("error", f"gave the error {str(error.tolist())[:80]}")
         return error
 
     def answer(self, known: Mapping[str, Any], timeout: float) -> tuple[np.ndarray, np.ndarray]:
         """Return the command, [n], and the memory, [H], for what is known, by name.
 
         Raises:
-            PolicyFailure: If they cannot be used, or if ``timeout`` s have passed since the policy was asked for the
+            AnswerError: If they cannot be used, or if ``timeout`` s have passed since the policy was asked for the
                 error.
         """
         command, memory = self._call(lambda: self._split(self._policy(*[known[name] for name in self._inputs])))
         took = self._stopwatch() - self._started
         if command.shape != self._command:
-            raise PolicyFailure("shape", f"gave the shape {list(command.shape)}")
+            raise AnswerError("shape", f"gave the shape {list(command.shape)}")
         if memory.shape != self.nothing.shape:
-            raise PolicyFailure("shape", f"gave a memory of the shape {list(memory.shape)}")
+            raise AnswerError("shape", f"gave a memory of the shape {list(memory.shape)}")
         if not np.isfinite(command).all():
-            raise PolicyFailure("not finite", "gave a command that is not finite")
+            raise AnswerError("not finite", "gave a command that is not finite")
         if not np.isfinite(memory).all():
-            raise PolicyFailure("not finite", "gave a memory that is not finite")
+            raise AnswerError("not finite", "gave a memory that is not finite")
         if took > timeout:
-            raise PolicyFailure("slow", f"took {took * 1e3:.1f} ms")
+            raise AnswerError("slow", f"took {took * 1e3:.1f} ms")
         return command, memory
 
     def _split(self, answer: Any) -> tuple[np.ndarray, np.ndarray]:
@@ -88,7 +88,7 @@ class CheckedPolicy:
         try:
             return call()
         except Exception as error:
-            raise PolicyFailure("exception", f"raised {type(error).__name__}: {_last_line(error)}") from None
+            raise AnswerError("exception", f"raised {type(error).__name__}: {_last_line(error)}") from None
 
 
 def _last_line(error: Exception) -> str:

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from physai.deploy.checked import CheckedPolicy, PolicyFailure
+from physai.deploy.checked import AnswerError, CheckedPolicy
 from physai.deploy.command import Command, State
 from physai.deploy.following import Following, Progress, Strain
 from physai.deploy.goals import Goal, GoalError, accept
@@ -338,7 +338,7 @@ class Controller:
                 LAST_COMMAND: self._interface.last_command,
             }
             answer, memory = self._asked.answer(known, config.policy_timeout)
-        except PolicyFailure as failure:
+        except AnswerError as failure:
             return self._policy_failed(failure, reasons)
         self._failures = 0
         wanted = self._interface.wanted(answer)
@@ -379,7 +379,7 @@ class Controller:
         self._step -= self._period
         return memory
 
-    def _policy_failed(self, failure: PolicyFailure, reasons: list[str]) -> tuple[None, np.ndarray]:
+    def _policy_failed(self, failure: AnswerError, reasons: list[str]) -> tuple[None, np.ndarray]:
         self._counters[f"policy failures: {failure.kind}"] += 1
         self._failures += 1
         reasons.append(f"the policy {failure}")

@@ -19,10 +19,9 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from physai.artifact.module import save
 from physai.deploy import Policy, PolicyError, load_policy, read_metadata
 from physai.deploy.archive import MAX_BYTES
-from tests.deploy.files import METADATA, commands, pack, records, refusal, sign
+from tests.deploy.files import METADATA, commands, pack, records, refusal, save, sign
 
 COMPRESSED = 0x08
 
@@ -313,7 +312,7 @@ class Awakened(nn.Module):
         return joint_position + self.memory
 
     @torch.jit.export
-    def distance(self, joint_position: Tensor, goal: Tensor) -> Tensor:
+    def error(self, joint_position: Tensor, goal: Tensor) -> Tensor:
         return joint_position.sum()
 
     @torch.jit.export

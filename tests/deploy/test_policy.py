@@ -12,11 +12,10 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
 
-from physai.artifact.module import save
 from physai.deploy import PolicyError, load_policy, read_metadata
 from physai.deploy.archive import content_sha256
 from physai.deploy.metadata import metadata_sha256
-from tests.deploy.files import METADATA, commands, pack, records, refusal, sign
+from tests.deploy.files import METADATA, commands, described, pack, records, refusal, save, sign
 
 # --- the policy that was exported
 
@@ -44,11 +43,15 @@ def test_another_number_of_values_than_joints_is_no_input(policy, wrong):
             policy(*inputs)
 
 
-def test_the_distance_is_that_of_the_arm(policy):
-    reach = policy.distance([0.0, 0.0], [0.0, 0.0])
-    assert reach == pytest.approx(policy.distance([1.0, 0.0], [0.0, 0.0]), abs=1e-5)  # the first joint turns all
-    assert policy.distance([0.0, 0.0], [reach, 0.0]) == pytest.approx(0.0, abs=1e-5)
-    assert policy.distance([0.0, 0.0], [reach - 0.1, 0.0]) == pytest.approx(0.1, abs=1e-5)
+def test_the_error_is_the_distance_of_the_arm(policy):
+    def distance(position, goal):
+        (error,) = policy.error(position, goal)
+        return error
+
+    reach = distance([0.0, 0.0], [0.0, 0.0])
+    assert reach == pytest.approx(distance([1.0, 0.0], [0.0, 0.0]), abs=1e-5)  # the first joint turns all
+    assert distance([0.0, 0.0], [reach, 0.0]) == pytest.approx(0.0, abs=1e-5)
+    assert distance([0.0, 0.0], [reach - 0.1, 0.0]) == pytest.approx(0.1, abs=1e-5)
 
 
 def test_in_torchrl_code_it_gives_the_same_commands(policy):
@@ -139,22 +142,19 @@ def test_a_hash_beside_that_is_a_dead_link_is_not_passed_over(content, path):
 # --- its robot
 
 
-def described(content: bytes, change) -> bytes:
-    """The file with changed metadata."""
-    good = records(content)
-    metadata = json.loads(good[METADATA])
-    change(metadata)
-    return pack(sign(good | {METADATA: json.dumps(metadata).encode()}))
-
-
 def test_the_joints_that_are_expected_are_accepted(content, path):
     path.write_bytes(content)
     for joints in (("joint1", "joint2"), ["joint1", "joint2"]):
         assert load_policy(path, expect_joints=joints).metadata.joints == ("joint1", "joint2")
 
 
+def swap_joints(metadata):
+    for joints in (metadata["robot"]["joints"], *(s["labels"] for s in metadata["inputs"] + metadata["outputs"])):
+        joints.sort(reverse=True)
+
+
 def test_swapped_joints_are_called_in_another_order(content, path):
-    path.write_bytes(described(content, lambda metadata: metadata["robot"]["joints"].reverse()))
+    path.write_bytes(described(content, swap_joints))
     message = refusal(path, expect_joints=["joint1", "joint2"])
     assert "in another order: ['joint2', 'joint1'], not ['joint1', 'joint2']" in message
 
@@ -166,8 +166,8 @@ def test_another_robots_joints_are_refused(content, path, joints):
 
 
 def test_another_format_version_is_refused_with_the_path(content, path):
-    path.write_bytes(described(content, lambda metadata: metadata.update(format_version=2)))
-    assert "format version 2" in refusal(path)
+    path.write_bytes(described(content, lambda metadata: metadata.update(format_version=1)))
+    assert "format version 1; this physai reads 2: export the policy again with it" in refusal(path)
 
 
 # --- altered weights
@@ -222,7 +222,7 @@ class Base(nn.Module):
         self.weight = nn.Parameter(torch.ones(2), requires_grad=False)
 
     @torch.jit.export
-    def distance(self, joint_position: Tensor, goal: Tensor) -> Tensor:
+    def error(self, joint_position: Tensor, goal: Tensor) -> Tensor:
         return torch.zeros(joint_position.size(0), 1)
 
 
@@ -246,18 +246,18 @@ class OneArgumentMore(Base):
         return joint_position * self.weight * gain
 
 
-class NoDistance(nn.Module):
+class NoError(nn.Module):
     def forward(self, joint_position: Tensor, joint_velocity: Tensor, goal: Tensor) -> Tensor:
         return joint_position
 
 
-class DistanceIsATensor(nn.Module):
+class ErrorIsATensor(nn.Module):
     def __init__(self) -> None:
         super().__init__()
-        self.register_buffer("distance", torch.ones(1))
+        self.register_buffer("error", torch.ones(1))
 
     def forward(self, joint_position: Tensor, joint_velocity: Tensor, goal: Tensor) -> Tensor:
-        return joint_position * self.distance
+        return joint_position * self.error
 
 
 class OtherShape(Base):
@@ -306,12 +306,12 @@ class Raises(Base):
         return joint_position
 
 
-class LongDistance(Base):
+class LongError(Base):
     def forward(self, joint_position: Tensor, joint_velocity: Tensor, goal: Tensor) -> Tensor:
         return joint_position
 
     @torch.jit.export
-    def distance(self, joint_position: Tensor, goal: Tensor) -> Tensor:
+    def error(self, joint_position: Tensor, goal: Tensor) -> Tensor:
         return joint_position
 
 
@@ -339,8 +339,8 @@ def test_another_module_is_refused(content, path):
         (FewerArguments, "its forward takes ['joint_position', 'goal'], not"),
         (OtherOrder, "its forward takes ['joint_velocity', 'joint_position', 'goal'], not"),
         (OneArgumentMore, "its forward takes"),
-        (NoDistance, "its distance takes None, not"),
-        (DistanceIsATensor, ""),
+        (NoError, "its error takes None, not"),
+        (ErrorIsATensor, ""),
         (OtherShape, "it gives float32 [4], not float32 [2]"),
         (OneForAll, "it gives float32 [1], not float32 [2]"),
         (OtherType, "it gives float64 [2], not float32 [2]"),
@@ -359,7 +359,7 @@ def test_another_module_in_a_forged_file_is_refused(content, path, module, reaso
 def golden_positions(content: bytes) -> dict:
     """Golden pairs of a policy that commands its positions, and thinks that it is always at the goal."""
     golden = json.loads(records(content)[METADATA])["golden"]
-    return golden | {"joint_velocity_command": golden["joint_position"], "distance": [[0.0]] * len(golden["goal"])}
+    return golden | {"joint_velocity_command": golden["joint_position"], "error": [[0.0]] * len(golden["goal"])}
 
 
 def test_a_forged_file_with_forged_golden_pairs_loads_and_only_its_hash_can_tell(content, path):
@@ -373,9 +373,17 @@ def test_a_command_that_is_no_number_in_a_few_of_the_golden_pairs_is_refused(con
     assert "a golden pair differs by nan" in refusal(path)
 
 
-def test_a_distance_that_is_no_number_is_refused(content, path):
-    path.write_bytes(disguise(LongDistance(), content, forged=True, golden=golden_positions(content)))
-    assert "cannot be run" in refusal(path)
+def test_an_error_of_another_size_is_refused(content, path):
+    path.write_bytes(disguise(LongError(), content, forged=True, golden=golden_positions(content)))
+    assert "it gives float32 [2], not float32 [1]" in refusal(path)
+
+
+def test_an_error_that_differs_from_the_golden_one_is_refused(content, path):
+    def change(metadata):
+        metadata["golden"]["error"][-1][0] += 1e-3
+
+    path.write_bytes(described(content, change))
+    assert "a golden pair differs by 0.001 in error" in refusal(path)
 
 
 # --- what reading metadata does, and what loading imports
