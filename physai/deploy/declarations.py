@@ -94,12 +94,14 @@ def parse_region(raw: dict[str, Any], key: str, size: int) -> Region:
     return region
 
 
-def parse_tolerances(raw: dict[str, Any], key: str) -> tuple[Tolerance, ...]:
+def parse_tolerances(raw: dict[str, Any], key: str, unit: str, region: Region) -> tuple[Tolerance, ...]:
     """Read how near is near enough: one for each unit.
 
     Raises:
-        PolicyError: If there is none, or one is not positive.
+        PolicyError: If there is none, or one is not positive, or, in the ``unit`` of the goals, larger than their
+            ``region``.
     """
+    largest = float(np.abs(region.bounds).max())
     declared = fields.get(raw, key, list)
     if not declared:
         raise PolicyError(f"metadata: {key} must not be empty")
@@ -108,8 +110,10 @@ def parse_tolerances(raw: dict[str, Any], key: str) -> tuple[Tolerance, ...]:
         what = f"{key}.{number}"
         if not isinstance(one, dict):
             raise PolicyError(f"metadata: {what} must be a tolerance")
-        value = fields.positive(_value(one, what, "value"), f"{what}.value", ())
-        found.append(Tolerance(_text(one, what, "name"), _text(one, what, "unit"), float(value)))
+        name, its_unit = _text(one, what, "name"), _text(one, what, "unit")
+        most = largest if its_unit == unit else math.inf
+        value = fields.positive(_value(one, what, "value"), f"{what}.value", (), most)
+        found.append(Tolerance(name, its_unit, float(value)))
     return tuple(found)
 
 

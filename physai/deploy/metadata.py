@@ -120,7 +120,9 @@ class Metadata:
         for key, kind in _FOR_PEOPLE.items():
             get(raw, key, kind)
         limits = {key: get(raw, f"limits.{key}", list) for key in ("position", "velocity", "effort", "command")}
-        tolerances = parse_tolerances(raw, "goal.tolerances")
+        goal = next(signal for signal in inputs if signal.name == GOAL)
+        region = parse_region(raw, "goal.region", goal.size)
+        tolerances = parse_tolerances(raw, "goal.tolerances", goal.unit, region)
         found = cls(
             raw=raw,
             robot=get(raw, "robot.name", str),
@@ -133,7 +135,7 @@ class Metadata:
             control_rate=float(fields.positive(get(raw, "control_rate", object), "control_rate", (), 1e4)),
             inputs=inputs,
             outputs=outputs,
-            region=parse_region(raw, "goal.region", next(s.size for s in inputs if s.name == GOAL)),
+            region=region,
             tolerances=tolerances,
             golden=_golden(raw, {s.name: s.size for s in (*inputs, *outputs)} | {ERROR: len(tolerances)}),
             content_sha256=get(raw, "content_sha256", str),

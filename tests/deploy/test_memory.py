@@ -84,7 +84,7 @@ def golden_nan(metadata):
         (lambda metadata: metadata["outputs"][-1].update(shape=[31]), "'new_memory' like 'memory'"),
         (forget_the_memory, "its forward takes ['joint_position', 'joint_velocity', 'goal', 'memory'], not"),
         (lambda metadata: metadata["golden"].pop("memory"), "golden.memory is missing"),
-        (golden_nan, "golden.new_memory must be finite"),
+        (golden_nan, "golden.new_memory must hold numbers"),
         (other_golden_memory("memory"), "a golden pair differs by"),
         (other_golden_memory("new_memory"), "a golden pair differs by 0.01 in new_memory"),
     ],

@@ -8,32 +8,38 @@ import numpy as np
 import pytest
 
 from physai.deploy import Metadata, PolicyError, read_metadata
-from physai.deploy.metadata import metadata_sha256
+from physai.deploy.declarations import parse_region, parse_signals
+from physai.deploy.metadata import describe_region, describe_signal, metadata_sha256
+from physai.signals import Box, Quantity, Ring, Signal, Tolerance
 
+SIGNALS = ("inputs.0", "inputs.1", "inputs.2", "outputs.0")
+SIGNAL_PARTS = ("name", "quantity", "unit", "shape", "low", "high", "labels", "frame")
 REQUIRED = [
     "robot.name",
     "robot.joints",
+    "robot.home",
     "inputs",
-    "inputs.joint_position",
-    "inputs.joint_velocity",
-    "inputs.goal",
     "outputs",
-    "outputs.joint_velocity_command",
+    *(f"{signal}.{part}" for signal in SIGNALS for part in SIGNAL_PARTS),
     "limits.position",
     "limits.velocity",
     "limits.effort",
     "limits.command",
     "control_rate",
-    "goal.frame",
-    "goal.radius",
-    "goal.tolerance",
+    "goal.region",
+    "goal.region.kind",
+    "goal.region.inner",
+    "goal.region.outer",
+    "goal.tolerances",
+    "goal.tolerances.0.name",
+    "goal.tolerances.0.unit",
+    "goal.tolerances.0.value",
     "golden",
     "golden.joint_position",
     "golden.joint_velocity",
     "golden.goal",
     "golden.joint_velocity_command",
-    "golden.distance",
-    "units",
+    "golden.error",
     "robot.urdf_sha256",
     "robot.end_effector",
     "checkpoint",
@@ -43,7 +49,10 @@ REQUIRED = [
     "created",
     "content_sha256",
 ]
-NUMBERS = [key for key in REQUIRED if key.startswith(("limits", "control", "goal.r", "goal.t", "golden."))]
+NUMBERS = [
+    *(key for key in REQUIRED if key.startswith(("limits", "control", "golden.", "robot.home"))),
+    *("goal.region.inner", "goal.region.outer", "goal.tolerances.0.value", "inputs.1.low", "outputs.0.high"),
+]
 
 
 @pytest.fixture(scope="module")
@@ -51,17 +60,27 @@ def good(exported_run) -> dict:
     return read_metadata(exported_run / "policy.pt").raw
 
 
+def inside(raw: dict, key: str) -> tuple[object, str | int]:
+    """What holds the value at a dotted key, and where in it."""
+    *folders, last = (int(part) if part.isdigit() else part for part in key.split("."))
+    for folder in folders:
+        raw = raw[folder]
+    return raw, last
+
+
+def value_of(raw: dict, key: str) -> object:
+    holder, last = inside(raw, key)
+    return holder[last]
+
+
 def changed(good: dict, key: str, value: object) -> str:
     """The metadata with another value at a dotted key; with none if the value is ``...``."""
     raw = copy.deepcopy(good)
-    *folders, last = key.split(".")
-    inside = raw
-    for folder in folders:
-        inside = inside[folder]
+    holder, last = inside(raw, key)
     if value is ...:
-        del inside[last]
+        del holder[last]
     else:
-        inside[last] = value
+        holder[last] = value
     return json.dumps(raw | {"metadata_sha256": metadata_sha256(raw)})
 
 
@@ -79,10 +98,16 @@ def test_all_that_a_controller_needs_is_there(good):
     assert (metadata.robot, metadata.joints) == ("planar_arm", ("joint1", "joint2"))
     assert metadata.position_limit.tolist() == [[-math.inf, math.inf], [-2.6, 2.6]]
     assert metadata.velocity_limit.shape == metadata.effort_limit.shape == metadata.command_limit.shape == (2,)
-    assert (metadata.control_rate, metadata.goal_frame) == (50.0, "base")
-    assert metadata.goal_radius[0] < metadata.goal_radius[1]
-    assert metadata.goal_tolerance > 0
-    assert metadata.golden.pop("distance").shape == (32, 1)
+    assert (metadata.control_rate, metadata.goal.frame, metadata.goal.unit) == (50.0, "base", "m")
+    assert [signal.name for signal in metadata.inputs] == ["joint_position", "joint_velocity", "goal"]
+    assert metadata.command is metadata.outputs[0]
+    assert (metadata.command.name, metadata.command.unit) == ("joint_velocity_command", "rad/s")
+    assert metadata.inputs[0].labels == metadata.command.labels == metadata.joints
+    assert metadata.inputs[0].bounds[0].tolist() == [-math.inf, -2.6]
+    assert metadata.region == Ring(0.3, 0.53)
+    assert metadata.tolerances == (Tolerance("distance", "m", 0.05),)
+    assert metadata.home.shape == (2,)
+    assert metadata.golden.pop("error").shape == (32, 1)
     assert {key: value.shape for key, value in metadata.golden.items()} == dict.fromkeys(metadata.golden, (32, 2))
     assert {value.dtype for value in metadata.golden.values()} == {np.dtype(np.float32)}
 
@@ -91,7 +116,7 @@ def test_all_that_a_controller_needs_is_there(good):
 def test_a_missing_part_is_named(good, key):
     message = refusal(changed(good, key, ...))
     assert key.split(".")[0] in message
-    if key.startswith(("robot", "limits", "goal", "control")) or "." not in key:
+    if key.startswith(("robot", "limits", "goal", "control", "inputs.", "outputs.")) or "." not in key:
         assert key in message
 
 
@@ -101,12 +126,17 @@ def test_a_missing_group_is_named(good, group):
 
 
 OTHER_TYPES = [None, {}, [], [[]], 7, True, "x", [{}], {"a": 1}]
-TEXTS = ("robot.name", "robot.urdf_sha256", "robot.end_effector", "goal.frame", "created", "content_sha256")
+TEXTS = ("robot.name", "robot.urdf_sha256", "robot.end_effector", "created", "content_sha256")
+TEXTS += ("goal.tolerances.0.name", "goal.tolerances.0.unit", "inputs.2.frame")
+UNUSED = tuple(f"{signal}.frame" for signal in SIGNALS)
 GROUPS, SINGLE_NUMBERS = ("checkpoint", "evaluation", "config", "versions"), ("control_rate",)
+EMPTY_BOUNDS = [(f"{signal}.{end}", []) for signal in SIGNALS for end in ("low", "high")]
 RIGHT = [
-    *((key, "x") for key in TEXTS),
+    *((key, "x") for key in (*TEXTS, *UNUSED)),
     *((key, value) for key in GROUPS for value in ({}, {"a": 1})),
     *((key, 7) for key in SINGLE_NUMBERS),
+    *EMPTY_BOUNDS,
+    *(("goal.region.outer", 7), ("inputs.2.labels", [])),
 ]
 
 
@@ -114,13 +144,14 @@ RIGHT = [
     ("key", "value"), [(key, value) for key in REQUIRED for value in OTHER_TYPES if (key, value) not in RIGHT], ids=repr
 )
 def test_a_part_of_another_type_is_named(good, key, value):
-    assert key.split(".")[0] in refusal(changed(good, key, value))
+    message = refusal(changed(good, key, value))
+    name = value_of(good, f"{key.rpartition('.')[0]}.name") if key.startswith(("inputs.", "outputs.")) else key
+    assert key.split(".")[0] in message or f"'{name}'" in message or "golden.x is missing" in message
 
 
 @pytest.mark.parametrize("key", NUMBERS)
 def test_numbers_of_another_shape_are_named(good, key):
-    group, _, last = key.partition(".")
-    value = good[group][last] if last else good[group]
+    value = value_of(good, key)
     for other in ([value], [value, value], value[:-1] if isinstance(value, list) else [1.0]):
         assert key in refusal(changed(good, key, other)) or key.startswith("golden")
 
@@ -133,15 +164,13 @@ def put(value: object, number: object) -> object:
 @pytest.mark.parametrize("number", [math.nan, math.inf, -math.inf, 10**400], ids=["NaN", "inf", "-inf", "10**400"])
 @pytest.mark.parametrize("key", NUMBERS)
 def test_numbers_that_are_none_are_refused(good, key, number):
-    group, _, last = key.partition(".")
-    value = good[group][last] if last else good[group]
+    value = value_of(good, key)
     refusal(changed(good, key, put(value, number)))
 
 
 @pytest.mark.parametrize("key", NUMBERS)
 def test_text_is_no_number(good, key):
-    group, _, last = key.partition(".")
-    value = good[group][last] if last else good[group]
+    value = value_of(good, key)
     refusal(changed(good, key, put(value, "2.5")))
 
 
@@ -152,12 +181,11 @@ def test_golden_numbers_that_are_too_large_for_float32_are_refused(good, key):
 
 
 @pytest.mark.parametrize(
-    "key", ["limits.velocity", "limits.effort", "limits.command", "control_rate", "goal.tolerance"]
+    "key", ["limits.velocity", "limits.effort", "limits.command", "control_rate", "goal.tolerances.0.value"]
 )
 @pytest.mark.parametrize("number", [0, -1.5])
 def test_a_limit_that_is_not_positive_is_refused(good, key, number):
-    group, _, last = key.partition(".")
-    value = good[group][last] if last else good[group]
+    value = value_of(good, key)
     assert f"{key} must be positive" in refusal(changed(good, key, put(value, number)))
 
 
@@ -168,9 +196,47 @@ def test_limits_of_position_are_pairs_and_null_is_no_limit(good):
     assert free.tolist() == [[-math.inf, math.inf], [-1, math.inf]]
 
 
-@pytest.mark.parametrize("radius", [[0.5, 0.3], [-0.1, 0.3]])
-def test_a_region_of_goals_that_cannot_be_is_refused(good, radius):
-    assert "goal.radius" in refusal(changed(good, "goal.radius", radius))
+@pytest.mark.parametrize(
+    ("region", "reason"),
+    [
+        ({"kind": "ring", "inner": 0.5, "outer": 0.3}, "goal.region: a ring needs"),
+        ({"kind": "ring", "inner": -0.1, "outer": 0.3}, "goal.region: a ring needs"),
+        ({"kind": "ring", "inner": 0.1}, "goal.region.outer is missing"),
+        ({"kind": "ring", "inner": 0.1, "outer": [0.3]}, "goal.region.outer must have the shape [], not [1]"),
+        ({"kind": "box", "low": [0, 0], "high": [1, -1]}, "goal.region: a box needs"),
+        ({"kind": "box", "low": [0], "high": [1]}, "goal.region.low must have the shape [2], not [1]"),
+        ({"kind": "box", "low": [0, 0, 0], "high": [1, 1, 1]}, "goal.region.low must have the shape [2], not [3]"),
+        ({"kind": "box", "low": [0, None], "high": [1, 1]}, "goal.region.low must hold numbers"),
+        ({"kind": "ball", "radius": 1}, "goal.region.kind must be one of ring, box"),
+    ],
+)
+def test_a_region_of_goals_that_cannot_be_is_refused(good, region, reason):
+    assert f"metadata: {reason}" in refusal(changed(good, "goal.region", region))
+
+
+@pytest.mark.parametrize("region", [Ring(0.2, 0.4), Box((-0.5, 0.0), (0.5, 0.25))])
+def test_a_region_is_read_as_it_was_written(good, region):
+    written = json.loads(json.dumps(describe_region(region)))
+    assert Metadata.parse(changed(good, "goal.region", written)).region == region
+
+
+def test_a_ring_is_of_goals_of_two_numbers(good):
+    assert parse_region({"region": {"kind": "ring", "inner": 0, "outer": 1}}, "region", 2) == Ring(0.0, 1.0)
+    with pytest.raises(PolicyError, match="region must be of goals of 3 numbers"):
+        parse_region({"region": {"kind": "ring", "inner": 0, "outer": 1}}, "region", 3)
+
+
+@pytest.mark.parametrize(
+    "signal",
+    [
+        Signal("camera", Quantity.VIEW, (2, 3, 3), (0.0,) * 18, (1.0,) * 18, frame="hand"),
+        Signal("force", Quantity.VIEW, (1,)),
+        Signal("joint_position", Quantity.JOINT_POSITION, (2,), (-math.inf, -1.5), (math.inf, 1.5), ("a", "b")),
+    ],
+)
+def test_a_signal_is_read_as_it_was_written(signal):
+    written = json.loads(json.dumps(describe_signal(signal), allow_nan=False))
+    assert parse_signals({"inputs": [written]}, "inputs") == (signal,)
 
 
 @pytest.mark.parametrize("joints", [[], ["a", "a"], ["a", 2], ["a", None], "ab", [["a"], ["b"]]], ids=repr)
@@ -183,15 +249,57 @@ def test_as_many_joints_as_everything_else_says(good, joints):
     assert "metadata: " in refusal(changed(good, "robot.joints", joints))
 
 
-@pytest.mark.parametrize("shape", [["N", 3], ["N"], [1, 2], "N2", ["N", 2, 1]], ids=repr)
-@pytest.mark.parametrize("key", ["inputs.goal", "inputs.joint_position", "outputs.joint_velocity_command"])
-def test_inputs_and_outputs_are_those_of_a_policy(good, key, shape):
-    assert f"metadata: {key.split('.')[0]} must be" in refusal(changed(good, key, shape))
+@pytest.mark.parametrize(
+    ("key", "value", "reason"),
+    [
+        *(("inputs.0.shape", shape, "inputs.0") for shape in ([3], [], [0], [-2], [2.0], ["N"], [10**9], [10**6] * 9)),
+        ("inputs.0.shape", [1, 2], "'joint_position' must have a number for each of robot.joints"),
+        ("inputs.2.shape", [1, 2], "'goal' must have one axis"),
+        ("inputs.0.labels", ["joint2", "joint1"], "'joint_position' must have a number for each of robot.joints"),
+        ("inputs.2.labels", ["x", "x"], "inputs.2.labels must be 2 distinct names, or none"),
+        ("inputs.0.quantity", "joint_velocity", "inputs.0.unit must be 'rad/s'"),
+        ("inputs.2.quantity", "force", "inputs.2.quantity is unknown: 'force'"),
+        ("inputs.2.unit", "mm", "inputs.2.unit must be 'm'"),
+        ("inputs.1.low", [3.0, 3.0], "inputs.1.low must not be above inputs.1.high"),
+        ("inputs.1.low", [-3.0], "inputs.1.low must have the shape [2], not [1]"),
+        ("inputs.1.name", "joint_position", "inputs and outputs must have distinct names"),
+        ("inputs.1.name", "error", "none of them 'error'"),
+        ("inputs.1.name", "goal", "inputs and outputs must have distinct names"),
+        ("inputs.0.name", "position", "inputs must have 'joint_position'"),
+        ("inputs.2.name", "target", "inputs must have 'goal'"),
+        ("inputs.1.name", "last_command", "'last_command' must be of the quantity joint_position"),
+        ("outputs.0.name", "gripper_command", "outputs must begin with joint_velocity_command or joint_position_comm"),
+        ("outputs.0.name", "joint_position_command", "outputs must begin with joint_velocity_command or joint_posit"),
+        ("outputs.0.shape", [1], "outputs.0"),
+        ("outputs", [], "outputs must not be empty"),
+        ("goal.tolerances", [], "goal.tolerances must not be empty"),
+    ],
+    ids=repr,
+)
+def test_signals_that_are_not_what_they_are_called_are_refused(good, key, value, reason):
+    assert f"metadata: {reason}" in refusal(changed(good, key, value)) or reason in refusal(changed(good, key, value))
 
 
-@pytest.mark.parametrize("key", ["inputs.image", "outputs.gripper"])
-def test_another_input_or_output_is_refused(good, key):
-    assert f"metadata: {key.split('.')[0]} must be" in refusal(changed(good, key, ["N", 2]))
+def add(good: dict, side: str, **changes: object) -> str:
+    one = describe_signal(Signal("another", Quantity.VIEW, (2,))) | changes
+    raw = copy.deepcopy(good)
+    raw["golden"][one["name"]] = [[0.0, 0.0]] * 32
+    return changed(raw, side, [*raw[side], one])
+
+
+def test_an_input_that_no_controller_knows_is_read_and_another_output_is_refused(good):
+    assert Metadata.parse(add(good, "inputs")).inputs[-1] == Signal("another", Quantity.VIEW, (2,))
+    assert "outputs must be ['joint_velocity_command']" in refusal(add(good, "outputs"))
+
+
+def test_the_last_command_is_an_input_of_position_commands_only(good):
+    changes = describe_signal(Signal("last_command", Quantity.JOINT_POSITION, (2,), labels=("joint1", "joint2")))
+    assert "'last_command' is an input of position commands only" in refusal(add(good, "inputs", **changes))
+
+
+def test_there_are_as_many_tolerances_as_errors(good):
+    two = [*good["goal"]["tolerances"], {"name": "angle", "unit": "rad", "value": 0.1}]
+    assert "golden.error must have the shape [32, 2], not [32, 1]" in refusal(changed(good, "goal.tolerances", two))
 
 
 def test_there_are_golden_pairs_and_all_are_complete(good):
@@ -203,10 +311,10 @@ def test_there_are_golden_pairs_and_all_are_complete(good):
         assert "golden." in refusal(changed(good, f"golden.{key}", [[], *rows[1:]]))
 
 
-@pytest.mark.parametrize("version", [0, 2, "1", None, [1], {}, -1, 1e300], ids=repr)
+@pytest.mark.parametrize("version", [0, 1, 3, "2", None, [1], {}, -1, 1e300], ids=repr)
 def test_another_format_version_is_named_and_how_to_mend_it(good, version):
     message = refusal(changed(good, "format_version", version))
-    assert f"format version {version!r}; this physai reads 1: export the policy again" in message
+    assert f"format version {version!r}; this physai reads 2: export the policy again" in message
     assert "format version None" in refusal(changed(good, "format_version", ...))
 
 
@@ -238,7 +346,7 @@ def test_text_that_is_no_json_is_called_damaged(text):
 
 @pytest.mark.parametrize("depth", [20, 100, 400, 900])
 @pytest.mark.parametrize(
-    "key", ["control_rate", "limits.position", "golden.goal", "robot.joints", "robot.name", "inputs"]
+    "key", ["control_rate", "limits.position", "golden.goal", "robot.joints", "robot.name", "inputs", "inputs.0.low"]
 )
 def test_deep_nesting_is_refused(good, key, depth):
     nested: list = []
@@ -248,5 +356,6 @@ def test_deep_nesting_is_refused(good, key, depth):
 
 
 def test_half_a_surrogate_in_a_name_makes_no_unprintable_message(good):
-    text = changed(good, "robot.joints", ["a", "\ud800"])
-    assert Metadata.parse(text).joints == ("a", "\ud800")
+    text = changed(good, "robot.name", "\ud800")
+    assert Metadata.parse(text).robot == "\ud800"
+    refusal(changed(good, "inputs.2.quantity", "\ud800"))
