@@ -120,8 +120,8 @@ def _first_difference(run: Any, wanted: Any, key: str = "") -> str | None:
 
 
 def _run(config: "TrainConfig", run_dir: Path, resume: bool, agent: "Agent | None" = None) -> None:
-    from physai.training.loop import Interrupted
     from physai.training.run import run_training
+    from physai.training.stopping import Interrupted
 
     complete = (run_dir / "summary.json").is_file()
     try:

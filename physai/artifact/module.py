@@ -160,7 +160,7 @@ def make_deployable(actor: TensorDictModuleBase, env: TransformedRobotEnv) -> De
             )
     pipeline = (RecurrentPipeline if memory_size else Pipeline)(
         simulation.task.module,
-        env.normalization.normalizer,
+        env.normalizer,
         actor.deterministic(),
         [VIEWS.index(key) for key in keys],
         simulation.joint_command,

@@ -18,7 +18,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torchrl.collectors.distributed import RayCollector
 
-from physai.collectors.worker import Acting, MakeEnv, WorkerCollector
+from physai.collectors.worker import MakeEnv, NormalizedPolicy, WorkerCollector
 from physai.config import nearest
 from physai.errors import UserError
 from physai.transforms.normalization import Normalizer
@@ -54,7 +54,7 @@ class RobotRayCollector(RayCollector):
         ray_init: dict[str, Any],
         **torchrl: Any,
     ) -> None:
-        self._acting = Acting(policy, normalizer)
+        self._policy_of_learner = NormalizedPolicy(policy, normalizer)
         self._ended = False
         self._watcher: subprocess.Popen[bytes] | None = None
         others = _descendants(os.getpid())
@@ -63,7 +63,7 @@ class RobotRayCollector(RayCollector):
             with _one_line():
                 super().__init__(
                     [partial(make_env, worker) for worker in range(workers)],
-                    self._acting.copy().policy,
+                    self._policy_of_learner.copy().policy,
                     sync=True,
                     collector_class=WorkerCollector,
                     collector_kwargs=[{"auto_register_policy_transforms": False} for _ in range(workers)],
@@ -88,7 +88,7 @@ class RobotRayCollector(RayCollector):
 
     def update_policy_weights_(self, *_: Any, **__: Any) -> None:
         """Send the workers what to act with; TorchRL calls it before each batch."""
-        weights = ray.put({name: value.cpu() for name, value in self._acting.state_dict().items()})
+        weights = ray.put({name: value.cpu() for name, value in self._policy_of_learner.state_dict().items()})
         for collector in self.remote_collectors:
             collector.renew.remote(weights)
 

@@ -9,7 +9,7 @@ import torch
 
 from physai.errors import UserError
 
-_FORMAT = 2
+_FORMAT = 3
 
 
 def write(path: Path, content: bytes) -> None:
