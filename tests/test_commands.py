@@ -156,18 +156,9 @@ def test_a_broken_urdf_names_the_part_that_is_broken(run, tmp_path, old, new, me
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.fixture(scope="module")
-def finished(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("commands")
-    process = command("train", *SMALL, "hydra.run.dir=run", cwd=folder)
-    output = process.communicate()[0]
-    assert process.returncode == 0, output
-    return folder / "run"
-
-
 @pytest.fixture
-def copied(finished, tmp_path):
-    shutil.copytree(finished, tmp_path / "run")
+def copied(small_run, tmp_path):
+    shutil.copytree(small_run, tmp_path / "run")
     return tmp_path / "run"
 
 

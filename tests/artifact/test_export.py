@@ -19,7 +19,7 @@ from physai.artifact.onnx import describe
 from physai.deploy import load_policy, read_metadata
 from physai.deploy.metadata import metadata_sha256
 from physai.errors import UserError
-from tests.training.small import SMALL, command
+from tests.training.small import EXPORTED, SMALL, command
 
 
 @pytest.fixture
@@ -186,7 +186,7 @@ def test_inspect_names_what_people_are_not_told(exported_run, tmp_path):
 
 @pytest.mark.slow
 def test_training_the_kuka_leaves_a_policy_and_its_hash(tmp_path):
-    process = command("train", *SMALL, "env=kuka_reacher", "hydra.run.dir=run", cwd=tmp_path)
+    process = command("train", *SMALL, EXPORTED, "env=kuka_reacher", "hydra.run.dir=run", cwd=tmp_path)
     output = process.communicate()[0]
     assert process.returncode == 0, output
     names = {"policy.pt", "policy.pt.sha256", "policy.onnx"}

@@ -15,25 +15,15 @@ from physai.training.agent import Agent
 from physai.training.checkpoint import load
 from physai.training.loop import train
 from physai.training.run import run_training
-from tests.training.small import SMALL, command, metrics, small_config
-
-
-@pytest.fixture(scope="module")
-def finished(tmp_path_factory):
-    """A run, in a folder as the command leaves it."""
-    folder = tmp_path_factory.mktemp("finished")
-    process = command("train", *SMALL, "hydra.run.dir=run", cwd=folder)
-    output = process.communicate()[0]
-    assert process.returncode == 0, output
-    return folder / "run", output
+from tests.training.small import SMALL, assert_same_run, command, metrics, resume_here, run_here, small_config
 
 
 def digest(run):
     return json.loads((run / "summary.json").read_text())["weights_sha256"]
 
 
-def test_a_run_folder_tells_its_whole_story(finished):
-    run, output = finished
+def test_a_run_folder_tells_its_whole_story(small_run):
+    run, output = small_run, (small_run.parent / "output.txt").read_text()
     summary = json.loads((run / "summary.json").read_text())
     assert {
         "success_rate",
@@ -66,8 +56,8 @@ def test_a_run_folder_tells_its_whole_story(finished):
     } <= set(events.Tags()["scalars"])
 
 
-def test_one_seed_gives_one_run_and_another_seed_another(finished, tmp_path):
-    run, _ = finished
+def test_one_seed_gives_one_run_and_another_seed_another(small_run, tmp_path):
+    run = small_run
     same, other = tmp_path / "same", tmp_path / "other"
     for path, seed in ((same, 0), (other, 1)):
         path.mkdir()
@@ -89,11 +79,17 @@ def wait_until(condition, process, seconds=60):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("moment", [0.0, 0.4, "writing"])
-def test_a_run_killed_at_any_moment_and_resumed_ends_like_the_uninterrupted_one(finished, tmp_path, moment):
-    run, _ = finished
+@pytest.mark.parametrize(
+    ("collector", "moment"), [("async", 0.0), ("async", 0.4), ("async", "writing"), ("single", 0.1)]
+)
+def test_a_run_killed_at_any_moment_and_resumed_ends_like_the_uninterrupted_one(
+    small_run, once, tmp_path, collector, moment
+):
+    whole = small_run
+    if collector == "single":
+        whole = once("small_run_single", lambda path: run_here(path / "run", *SMALL, "collector=single")) / "run"
     checkpoints = tmp_path / "run" / "checkpoints"
-    process = command("train", *SMALL, "hydra.run.dir=run", cwd=tmp_path)
+    process = command("train", *SMALL, f"collector={collector}", "hydra.run.dir=run", cwd=tmp_path)
     if moment == "writing":
         wait_until(lambda: checkpoints.is_dir() and len(list(checkpoints.glob("0*.pt"))) >= 2, process)
         wait_until(lambda: any(checkpoints.glob(".*.tmp")), process)
@@ -102,17 +98,13 @@ def test_a_run_killed_at_any_moment_and_resumed_ends_like_the_uninterrupted_one(
         time.sleep(moment)
     process.kill()
     assert process.wait() == -signal.SIGKILL
-    resumed = command("train", "resume=run", cwd=tmp_path)
-    output = resumed.communicate()[0]
-    assert resumed.returncode == 0, output
-    assert digest(tmp_path / "run") == digest(run)
-    assert metrics(tmp_path / "run") == metrics(run)
-    assert (tmp_path / "run" / "episodes.csv").read_bytes() == (run / "episodes.csv").read_bytes()
+    resume_here(tmp_path / "run")
+    assert_same_run(tmp_path / "run", whole)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-def test_a_stopped_run_saves_says_how_to_go_on_and_goes_on(finished, tmp_path, number, code):
+def test_a_stopped_run_saves_says_how_to_go_on_and_goes_on(small_run, tmp_path, number, code):
     process = command("train", *SMALL, "checkpoint.every_frames=1000000", "hydra.run.dir=run", cwd=tmp_path)
     wait_until((tmp_path / "run" / "metrics.csv").is_file, process)
     os.kill(process.pid, number)
@@ -123,7 +115,7 @@ def test_a_stopped_run_saves_says_how_to_go_on_and_goes_on(finished, tmp_path, n
     resumed = command("train", "resume=run", cwd=tmp_path)
     output = resumed.communicate()[0]
     assert resumed.returncode == 0, output
-    assert digest(tmp_path / "run") == digest(finished[0])
+    assert_same_run(tmp_path / "run", small_run)
 
 
 def test_robots_that_judge_are_built_when_first_needed_and_that_moves_no_random_number():
@@ -147,8 +139,8 @@ def test_more_goals_than_robots_are_judged_in_rounds(monkeypatch):
     agent.close()
 
 
-def test_resuming_a_complete_run_shows_its_result(finished, capsys):
-    run, _ = finished
+def test_resuming_a_complete_run_shows_its_result(small_run, capsys):
+    run = small_run
     before = digest(run)
     run_training(small_config(), run, resume=True)
     assert "complete already" in capsys.readouterr().out

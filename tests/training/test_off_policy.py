@@ -10,7 +10,7 @@ import torch
 
 from physai.training.agent import Agent
 from physai.training.loop import train
-from tests.training.small import SMALL, command, metrics, small_config
+from tests.training.small import SMALL, command, metrics, resume_here, small_config
 
 OFF_POLICY = (
     "algo=sac",
@@ -69,9 +69,7 @@ def test_killed_and_resumed_it_ends_like_the_uninterrupted_run(finished, tmp_pat
         time.sleep(0.01)
     process.send_signal(signal.SIGKILL)
     assert process.wait() == -signal.SIGKILL
-    process = command("train", "resume=run", cwd=tmp_path)
-    output = process.communicate()[0]
-    assert process.returncode == 0, output
+    resume_here(tmp_path / "run")
     whole, digest = finished
     assert json.loads((tmp_path / "run" / "summary.json").read_text())["weights_sha256"] == digest
     assert metrics(tmp_path / "run") == metrics(whole)
