@@ -13,7 +13,6 @@ from filelock import FileLock
 from hypothesis import HealthCheck, settings
 from omegaconf import OmegaConf
 
-from physai.artifact import export_policy
 from physai.config import compose, conf_dir, validate
 from physai.envs.simulation import EnvConfig
 from physai.training.config import TrainConfig
@@ -102,6 +101,8 @@ def _train_and_export(*arguments: Any) -> None:
     (run / ".hydra").mkdir()
     (run / ".hydra" / "config.yaml").write_text(OmegaConf.to_yaml(node))
     run_training(validate(TrainConfig, node), run)
+    from physai.artifact import export_policy  # it takes a second to import, which few tests need
+
     export_policy(run, "best", ["torchscript", "onnx"])
 
 

@@ -1,4 +1,4 @@
-"""The controller: from joint states and goals to safe velocity commands. No ROS; time is an argument."""
+"""The controller: from joint states and goals to safe commands. No ROS; time is an argument."""
 
 import math
 import time
@@ -11,21 +11,29 @@ import numpy as np
 from physai.deploy.command import Command, State
 from physai.deploy.following import Following, Progress, Strain
 from physai.deploy.goals import Goal, GoalError, accept
+from physai.deploy.interfaces import make_interface
 from physai.deploy.joints import Heard, JointReader, JointState, JointStateError
 from physai.deploy.limits import LATE, VelocityLimits, check
+from physai.deploy.metadata import GOAL, LAST_COMMAND, MEMORY
 from physai.deploy.parameters import ControllerConfig
 from physai.deploy.policy import Policy
+from physai.errors import UserError
 
 _STILL = 3  # updates in a row at the same time
 _STEP = 0.75  # periods; what is asked again sooner is the same step of a policy that remembers
+_INPUTS = ("joint_position", "joint_velocity", GOAL, LAST_COMMAND, MEMORY)
 _MOVED = 0.1  # tolerances; a goal that moves by less is still the same
+
+Motion = tuple[np.ndarray, np.ndarray]
+"""A velocity [n], rad/s, and what the policy remembers, [H]."""
 
 
 class Controller:
     """Drives one robot: call ``update`` at the policy's control rate, and send what it returns.
 
-    On any doubt it commands zero velocity: at once, whatever the acceleration limit. From a hold it recovers by
-    itself; from a fault and an emergency stop only by ``reset``, and a new goal.
+    On any doubt it lets the arm stand still, by zero velocities or by the positions where it is: at once, whatever the
+    acceleration limit. From a hold it recovers by itself; from a fault and an emergency stop only by ``reset``, and a
+    new goal.
 
     What a policy remembers begins with zeros, as its episodes did: at a new goal, and after every tick at which it did
     not drive.
@@ -36,7 +44,7 @@ class Controller:
         stopwatch: Measures how long the policy took, in s; no other decision depends on a clock.
 
     Raises:
-        UserError: If the limits do not fit the robot.
+        UserError: If the limits do not fit the robot, or the policy takes what this controller cannot tell it.
     """
 
     def __init__(
@@ -46,15 +54,21 @@ class Controller:
         stopwatch: Callable[[], float] = time.perf_counter,
     ) -> None:
         self.policy = policy
-        self._period = 1.0 / policy.metadata.control_rate
+        metadata = policy.metadata
+        for signal in metadata.inputs:
+            if signal.name not in _INPUTS:
+                raise UserError(f"the policy takes '{signal.name}': this controller can tell {', '.join(_INPUTS)}")
+        self._period = 1.0 / metadata.control_rate
+        self._tolerance = np.array([tolerance.value for tolerance in metadata.tolerances])
         self._stopwatch = stopwatch
         self._zeros = self._last = np.zeros(len(policy.metadata.joints))
         self._counters: Counter[str] = Counter()
         self._latched: State | None = None
         self._latch_reason = ""
         config = config or ControllerConfig()
+        self._interface = make_interface(metadata, config)
         self._robot = JointReader(policy.metadata, config)
-        self._progress = Progress(policy.metadata.goal_tolerance)
+        self._progress = Progress()
         self._strain = Strain(policy.metadata)
         self.configure(config)
         self._now: float | None = None
@@ -81,6 +95,7 @@ class Controller:
         check(config, self.policy.metadata)
         self.config = config
         self._robot.configure(config)
+        self._interface.configure(config)
         self._limits = VelocityLimits(self.policy.metadata, config)
         self._following = Following(self.policy.metadata, config)
         # A lower velocity holds at once, whatever the acceleration limit: the margin may be too narrow for another.
@@ -105,7 +120,7 @@ class Controller:
                 until there is none.
 
         Returns:
-            Velocities [n] in rad/s, or none before the first joint state; with state and reasons.
+            A command [n], or none before the first joint state; with state and reasons.
         """
         reasons: list[str] = []
         self._counters["updates"] += 1
@@ -124,21 +139,31 @@ class Controller:
             what = "joint state" if oldest is None else f"state of '{oldest}'"
             reasons.append(self._hold("state old", f"the last {what} is {now - self._received:.3f} s old"))
         state = self._state(interlocks, reasons)
-        velocity, memory = self._zeros, self._nothing
+        motion = None
         if state is State.ACTIVE:
             if not stop:
-                velocity, memory = self._drive(elapsed, reasons)
+                motion = self._drive(elapsed, reasons)
             state = State.HOLD if self._gave_up else State.REACHED if self._reached else State.ACTIVE
         if self._latched not in (None, state):  # an emergency stop while the policy was asked, or a policy that failed
-            velocity, memory, state = self._zeros, self._nothing, self._latched
+            motion, state = None, self._latched
             reasons.append(self._latch_reason)
         if state is not self._command.state:
             self._since = self._now or 0.0
             self._counters[f"entered {state.value}"] += 1
-        self._last, self._memory = velocity, memory
+        position = self._robot.position
+        if motion is None:
+            value, self._last, self._memory = self._interface.stand(position), self._zeros, self._nothing
+        else:
+            velocity, self._memory = motion
+            value, self._last = self._interface.drive(velocity, position, elapsed)
         unheard = state is State.WAITING and self._received == -math.inf
-        self._command = Command(None if unheard else velocity.copy(), state, tuple(reasons))
+        self._command = Command(None if unheard or value is None else value.copy(), state, tuple(reasons))
         return self._command
+
+    @property
+    def standstill(self) -> np.ndarray:
+        """The command [n] that stands still where the arm is now."""
+        return self._interface.standstill(self._robot.position)
 
     def emergency_stop(self) -> None:
         """Stop at once; only ``reset`` ends it."""
@@ -181,7 +206,7 @@ class Controller:
             "recovery_states_needed": self._needed,
             "last_hold": self._hold_reason,
             "goal": None if self._goal is None else self._goal.tolist(),
-            "velocity": None if self._command.velocity is None else self._command.velocity.tolist(),
+            "command": None if self._command.value is None else self._command.value.tolist(),
             "policy_failures_in_a_row": self._failures,
             "policy_sha256": self.policy.sha256,
             "counters": dict(self._counters),
@@ -209,17 +234,16 @@ class Controller:
 
     def _take_goal(self, goal: Goal, reasons: list[str]) -> None:
         try:
-            new = accept(goal, self.policy.metadata, self.config.unreachable_goal == "project")
+            new, projected = accept(goal, self.policy.metadata, self.config.unreachable_goal == "project")
         except GoalError as rejected:
             self._counters[f"goals rejected: {rejected.kind}"] += 1
             reasons.append(str(rejected))
             return
         self._counters["goals"] += 1
-        if not np.array_equal(new, goal.position):
+        if projected:
             self._counters["goals projected"] += 1
             reasons.append(f"goal out of reach: {new.tolist()} is the nearest in reach")
-        tolerance = self.policy.metadata.goal_tolerance
-        if self._goal is None or np.abs(new - self._goal).max() > _MOVED * tolerance:
+        if self._goal is None or np.abs(new - self._goal).max() > _MOVED * self._tolerance[0]:
             self._reached, self._gave_up = False, ""
             self._progress.restart()
             self._memory = self._nothing
@@ -309,38 +333,46 @@ class Controller:
             reasons.append("no goal yet")
         return State.WAITING if interlocks or self._goal is None else State.ACTIVE
 
-    def _drive(self, elapsed: float, reasons: list[str]) -> tuple[np.ndarray, np.ndarray]:
-        """Ask the policy, and limit what it wants; return the velocity, and what the policy remembers."""
+    def _drive(self, elapsed: float, reasons: list[str]) -> Motion | None:
+        """Ask the policy, and limit what it wants; return the velocity, and what it remembers; None to stand."""
         assert self._goal is not None
-        robot, metadata = self._robot, self.policy.metadata
+        robot = self._robot
         started = self._stopwatch()
         try:
-            distance = self.policy.distance(robot.turned, self._goal)
-            if not 0 <= distance < math.inf:
-                return self._policy_failed("distance", f"gave the distance {distance}", reasons)
-            self._reached = distance < metadata.goal_tolerance * (
-                self.config.reached_hysteresis if self._reached else 1
-            )
+            error = np.asarray(self.policy.error(robot.turned, self._goal))
+            if error.shape != self._tolerance.shape or not ((error >= 0) & (error < math.inf)).all():
+                self._policy_failed("error", f"gave the error {error.tolist()}", reasons)
+                return None
+            tolerances = float((error / self._tolerance).max())
+            self._reached = tolerances < (self.config.reached_hysteresis if self._reached else 1)
             if self._reached:
                 self._progress.restart()
-                return self._zeros, self._nothing
-            if self._progress.waited(distance, elapsed) > self.config.progress_timeout:
-                return self._give_up(distance, reasons)
-            wanted, memory = self._ask(robot.turned, robot.velocity, self._goal)
+                return None
+            if self._progress.waited(tolerances, elapsed) > self.config.progress_timeout:
+                self._give_up(error, reasons)
+                return None
+            answer, memory = self._ask(self._goal)
         except Exception as error:  # a policy is a foreign program
-            return self._policy_failed("exception", f"raised {type(error).__name__}: {_last_line(error)}", reasons)
+            self._policy_failed("exception", f"raised {type(error).__name__}: {_last_line(error)}", reasons)
+            return None
         took = self._stopwatch() - started
-        if wanted.shape != self._zeros.shape:
-            return self._policy_failed("shape", f"gave the shape {list(wanted.shape)}", reasons)
+        if answer.shape != self._zeros.shape:
+            self._policy_failed("shape", f"gave the shape {list(answer.shape)}", reasons)
+            return None
         if memory.shape != self._nothing.shape:
-            return self._policy_failed("shape", f"gave a memory of the shape {list(memory.shape)}", reasons)
-        if not np.isfinite(wanted).all():
-            return self._policy_failed("not finite", "gave a velocity that is not finite", reasons)
+            self._policy_failed("shape", f"gave a memory of the shape {list(memory.shape)}", reasons)
+            return None
+        if not np.isfinite(answer).all():
+            self._policy_failed("not finite", "gave a command that is not finite", reasons)
+            return None
         if not np.isfinite(memory).all():
-            return self._policy_failed("not finite", "gave a memory that is not finite", reasons)
+            self._policy_failed("not finite", "gave a memory that is not finite", reasons)
+            return None
         if took > self.config.policy_timeout:
-            return self._policy_failed("slow", f"took {took * 1e3:.1f} ms", reasons)
+            self._policy_failed("slow", f"took {took * 1e3:.1f} ms", reasons)
+            return None
         self._failures = 0
+        wanted = self._interface.velocity(answer, robot.position, robot.turned)
         if self._limits.out_of_range(wanted):
             self._counters["commands clamped"] += 1
             reasons.append("the policy's command was beyond its range")
@@ -350,13 +382,16 @@ class Controller:
             reasons.append(held_back)
         return velocity, self._remember(memory, elapsed)
 
-    def _give_up(self, distance: float, reasons: list[str]) -> tuple[np.ndarray, np.ndarray]:
+    def _give_up(self, error: np.ndarray, reasons: list[str]) -> None:
         self._counters["holds: no progress"] += 1
+        far = ", ".join(
+            f"{value:.3f} {tolerance.unit}"
+            for value, tolerance in zip(error.tolist(), self.policy.metadata.tolerances, strict=True)
+        )
         self._gave_up = self._hold_reason = (
-            f"no progress for {self.config.progress_timeout:g} s, {distance:.3f} m from the goal: waiting for another"
+            f"no progress for {self.config.progress_timeout:g} s, {far} from the goal: waiting for another"
         )
         reasons.append(self._gave_up)
-        return self._zeros, self._nothing
 
     def _remember(self, memory: np.ndarray, elapsed: float) -> np.ndarray:
         """Return the new memory, or the old one: who asks more often than in training must not make time run faster."""
@@ -366,19 +401,28 @@ class Controller:
         self._step -= self._period
         return memory
 
-    def _ask(self, position: np.ndarray, velocity: np.ndarray, goal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _ask(self, goal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the policy's answer, and its new memory."""
+        robot = self._robot
+        told = {
+            "joint_position": robot.turned,
+            "joint_velocity": robot.velocity,
+            GOAL: goal,
+            MEMORY: self._memory,
+            **self._interface.inputs(robot.position, robot.turned),
+        }
+        answer = self.policy(*(told[signal.name] for signal in self.policy.metadata.inputs))
         if not self.policy.metadata.memory_size:
-            return np.asarray(self.policy(position, velocity, goal), dtype=np.float64), self._nothing
-        wanted, memory = self.policy(position, velocity, goal, self._memory)
-        return np.asarray(wanted, dtype=np.float64), np.asarray(memory, dtype=np.float32)
+            return np.asarray(answer, dtype=np.float64), self._nothing
+        command, memory = answer
+        return np.asarray(command, dtype=np.float64), np.asarray(memory, dtype=np.float32)
 
-    def _policy_failed(self, kind: str, what: str, reasons: list[str]) -> tuple[np.ndarray, np.ndarray]:
+    def _policy_failed(self, kind: str, what: str, reasons: list[str]) -> None:
         self._counters[f"policy failures: {kind}"] += 1
         self._failures += 1
         reasons.append(f"the policy {what}")
         if self._failures >= self.config.policy_failures:
             self._fault("policy", f"the policy failed {self._failures} times in a row; at last it {what}")
-        return self._zeros, self._nothing
 
 
 def _last_line(error: Exception) -> str:

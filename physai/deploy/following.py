@@ -12,6 +12,7 @@ from physai.deploy.parameters import ControllerConfig
 # noise of 5 mrad), and with 50 ms of delay more: README, "An arm that does not follow".
 _DELAY = 0.16  # s; measured motion may be that of commands up to so much older
 _FLOOR = 0.015  # rad
+_PROGRESS = 0.1  # tolerances
 _DRAGGED = 0.5  # share of the fastest joint's motion that the others may be dragged along with, of following_error
 
 
@@ -151,14 +152,9 @@ class Following:
 
 
 class Progress:
-    """Whether the distance to a goal still falls.
+    """Whether the distance to a goal, in tolerances, still falls; a tenth of one counts as progress."""
 
-    Args:
-        tolerance: What counts as reached, in the distance's unit; a tenth of it counts as progress.
-    """
-
-    def __init__(self, tolerance: float) -> None:
-        self._step = 0.1 * tolerance
+    def __init__(self) -> None:
         self.restart()
 
     def restart(self) -> None:
@@ -167,7 +163,7 @@ class Progress:
 
     def waited(self, distance: float, elapsed: float) -> float:
         """Return for how long, s, the distance has not fallen, ``elapsed`` s after it was asked last."""
-        if distance < self._best - self._step:
+        if distance < self._best - _PROGRESS:
             self._best, self._waited = distance, 0.0
         else:
             self._waited += elapsed

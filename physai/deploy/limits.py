@@ -10,6 +10,8 @@ from physai.errors import UserError
 
 LATE = 3.0  # control periods; an update that comes later stands still
 
+_ROOM = 1 + 1e-4  # positions of single precision make so much of a velocity
+
 
 class VelocityLimits:
     """Limits on a vector of joint velocities.
@@ -35,8 +37,8 @@ class VelocityLimits:
         return int(far.argmax()) if far.any() else None
 
     def out_of_range(self, wanted: np.ndarray) -> bool:
-        """Whether this is more than the policy was trained to command (with room for rounding)."""
-        return bool((np.abs(wanted) > self._command * (1 + 1e-6)).any())
+        """Whether this is more than the policy was trained to ask for (with room for rounding)."""
+        return bool((np.abs(wanted) > self._command * _ROOM).any())
 
     def apply(
         self, wanted: np.ndarray, position: np.ndarray, last: np.ndarray, elapsed: float

@@ -138,9 +138,9 @@ class PyBulletPhysics:
         self._advance(command.ravel().tolist())
         return self.robot_state()
 
-    def _advance(self, velocity: list[float]) -> None:
+    def _advance(self, targets: list[float]) -> None:
         # One flat pass over all joints of all robots: this loop is what collection costs most.
-        commands = zip(self._motors, velocity, self._velocity, strict=True)
+        commands = zip(self._motors, targets, self._velocity, strict=True)
         command, step, read = bullet.setJointMotorControl2, bullet.stepSimulation, bullet.getJointStates
         mode, joints = bullet.VELOCITY_CONTROL, self._joints
         positions: list[float] = []

@@ -71,7 +71,8 @@ def evaluate(policy: TensorDictModuleBase, env: TransformedRobotEnv, episodes: i
     env.set_seed(seed)
     rounds = [_one_round(policy, env) for _ in range(-(-episodes // env.simulation.num_envs))]
     columns = (torch.cat(column)[:episodes] for column in zip(*rounds, strict=True))
-    return Evaluation(*columns, unit=env.simulation.task.tolerances[0].unit)
+    success, length, error, episode_return = columns
+    return Evaluation(success, length, error, episode_return, env.simulation.task.tolerances[0].unit)
 
 
 @torch.no_grad()

@@ -22,8 +22,8 @@ class SensorModel(StochasticTransform):
         self._errors = SensorErrors(layout)
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        true = (next_tensordict.get(key) for key in self.in_keys)
-        read = self._errors(*true, next_tensordict.get("physics_parameters"), self.generator)
+        position, velocity = (next_tensordict.get(key) for key in self.in_keys)
+        read = self._errors(position, velocity, next_tensordict.get("physics_parameters"), self.generator)
         for key, value in zip(self.out_keys, read, strict=True):
             next_tensordict.set(key, value)
         return next_tensordict

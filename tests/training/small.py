@@ -1,5 +1,6 @@
 """Runs that are small enough to test with."""
 
+import contextlib
 import csv
 import json
 import os
@@ -11,8 +12,10 @@ from typing import Any
 from omegaconf import OmegaConf
 
 from physai.config import compose, validate
+from physai.training.agent import Agent
+from physai.training.callbacks import EvaluationCallback
 from physai.training.config import TrainConfig
-from physai.training.run import load_config, run_training
+from physai.training.run import load_config, make_trainer, run_training
 
 SMALL = (
     "total_frames=16384",
@@ -57,6 +60,14 @@ def run_here(run: Path, *overrides: str) -> None:
     node = compose("train", overrides)
     (run / ".hydra" / "config.yaml").write_text(OmegaConf.to_yaml(node))
     run_training(validate(TrainConfig, node), run)
+
+
+def train_here(config: TrainConfig, run: Path, resume: bool = False) -> Agent:
+    """Train, without the evaluation at the end; return the agent, closed."""
+    agent = Agent.build(config)
+    with contextlib.closing(agent):
+        make_trainer(config, run, agent, EvaluationCallback(config), resume).fit()
+    return agent
 
 
 def resume_here(run: Path) -> None:

@@ -7,8 +7,16 @@ import pytest
 import torch
 
 from physai.training.agent import Agent
-from physai.training.loop import train
-from tests.training.small import SMALL, assert_same_run, command, metrics, resume_here, run_here, small_config
+from tests.training.small import (
+    SMALL,
+    assert_same_run,
+    command,
+    metrics,
+    resume_here,
+    run_here,
+    small_config,
+    train_here,
+)
 
 RECURRENT = ("policy=gru", *SMALL, "collector.num_envs=64", "total_frames=8192")  # sequences of 16 steps
 
@@ -49,8 +57,7 @@ def test_one_seed_gives_one_run(tmp_path):
     hashes = []
     for name in ("one", "two"):
         (tmp_path / name).mkdir()
-        agent, _ = train(small_config(*RECURRENT, "total_frames=4096"), tmp_path / name, resume=False)
-        agent.close()
+        agent = train_here(small_config(*RECURRENT, "total_frames=4096"), tmp_path / name)
         hashes.append(agent.weights_sha256())
     assert hashes[0] == hashes[1]
 
