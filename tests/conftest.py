@@ -90,6 +90,13 @@ def exported_run(once: Callable[[str, Callable[[Path], None]], Path]) -> Path:
 
 
 @pytest.fixture(scope="session")
+def position_run(once: Callable[[str, Callable[[Path], None]], Path]) -> Path:
+    """The same, of an arm that is driven by joint positions."""
+    command = "env.robot.command=joint_position"
+    return once("position_run", partial(_train_and_export, command, "total_frames=100_000"))
+
+
+@pytest.fixture(scope="session")
 def recurrent_run(once: Callable[[str, Callable[[Path], None]], Path]) -> Path:
     """The same, of a policy that remembers."""
     return once("recurrent_run", partial(_train_and_export, "policy=gru", "total_frames=80_000"))

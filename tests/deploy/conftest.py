@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from physai.deploy import Policy, load_policy
+from physai.signals import Quantity
 
 pytest.register_assert_rewrite("tests.deploy.world")
 
@@ -17,6 +18,12 @@ pytest.register_assert_rewrite("tests.deploy.world")
 def policy(exported_run) -> Policy:
     """The real policy of a two-link arm: loaded once, not to be changed."""
     return load_policy(exported_run / "policy.pt")
+
+
+@pytest.fixture(scope="session")
+def position_policy(position_run) -> Policy:
+    """The same, of an arm that is driven by positions."""
+    return load_policy(position_run / "policy.pt")
 
 
 def _raise(command: np.ndarray) -> None:
@@ -34,19 +41,20 @@ FAILURES: dict[str, Callable[[np.ndarray], Any]] = {
     "exception": _raise,
     "slow": lambda command: command,
 }
-DISTANCES = {"distance NaN": math.nan, "distance infinite": math.inf, "distance negative": -0.01}
-ALL_FAILURES = (*FAILURES, *DISTANCES)
+ERRORS = {"error NaN": [math.nan], "error infinite": [math.inf], "error negative": [-0.01], "two errors": [0.1, 0.1]}
+ALL_FAILURES = (*FAILURES, *ERRORS)
 
 
 class Troubled:
     """A policy that answers as the one inside, unless ``trouble`` is one of ALL_FAILURES or a function of its command.
 
-    With the trouble "emergency stop" it calls ``stop``, too. Its stopwatch stands still but for slow answers.
+    With the trouble "emergency stop" it calls ``stop``, too. Its stopwatch stands still but for slow answers. What is
+    a function of the command is one of its velocity where commands are positions, too.
     """
 
     def __init__(self, policy: Any) -> None:
         self.policy, self.metadata, self.sha256 = policy, policy.metadata, policy.sha256
-        self.trouble: str | Callable[[np.ndarray], Any] | None = None
+        self.trouble: Any = None
         self.stop: Callable[[], None] | None = None
         self.seconds = 0.0
         self.forget()
@@ -58,21 +66,25 @@ class Troubled:
     def stopwatch(self) -> float:
         return self.seconds
 
-    def distance(self, joint_position: np.ndarray, goal: np.ndarray) -> float:
+    def error(self, joint_position: np.ndarray, goal: np.ndarray) -> Any:
         self.goal = goal
-        if self.trouble in DISTANCES:
+        if self.trouble in ERRORS:
             self.failed = True
-            return DISTANCES[self.trouble]
-        self.measured = self.policy.distance(joint_position, goal)
-        return self.measured
+            return np.array(ERRORS[self.trouble])
+        error = self.policy.error(joint_position, goal)
+        self.measured = float(error[0])
+        return error
 
-    def __call__(self, joint_position: np.ndarray, joint_velocity: np.ndarray, goal: np.ndarray) -> Any:
+    def __call__(self, *inputs: np.ndarray) -> Any:
         self.called = True
-        command = self.policy(joint_position, joint_velocity, goal)
+        command = self.policy(*inputs)
         if self.trouble is None:
             return command
-        if not isinstance(self.trouble, str):
-            return self.trouble(command)
+        if callable(self.trouble):
+            if self.metadata.command.quantity is Quantity.JOINT_VELOCITY:
+                return self.trouble(command)
+            last, period = np.asarray(inputs[3], np.float64), 1.0 / self.metadata.control_rate
+            return last + self.trouble((command - last) / period) * period
         if self.trouble == "emergency stop":
             self.stopped = True
             self.stop()

@@ -313,7 +313,7 @@ class Awakened(nn.Module):
         return joint_position + self.memory
 
     @torch.jit.export
-    def distance(self, joint_position: Tensor, goal: Tensor) -> Tensor:
+    def error(self, joint_position: Tensor, goal: Tensor) -> Tensor:
         return joint_position.sum()
 
     @torch.jit.export

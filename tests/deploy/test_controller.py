@@ -9,7 +9,7 @@ import pytest
 from physai.deploy import Controller, ControllerConfig, Goal, JointState, State
 from physai.envs.simulation import Simulation
 from physai.errors import UserError
-from tests.deploy.conftest import ALL_FAILURES, DISTANCES, Troubled
+from tests.deploy.conftest import ALL_FAILURES, ERRORS, Troubled
 
 PERIOD = 0.02
 NAMES = ("joint1", "joint2")
@@ -44,7 +44,7 @@ class Robot:
         self.tick(goal=FAR_GOAL)
         command = self.ticks(20)[-1]
         assert command.state is State.ACTIVE
-        assert np.abs(command.velocity).max() == pytest.approx(0.3)
+        assert np.abs(command.value).max() == pytest.approx(0.3)
         assert command.reasons == ()
         return command
 
@@ -53,7 +53,7 @@ class Robot:
         candidates = [
             [r * math.cos(a), r * math.sin(a)] for r in (0.4, 0.45, 0.5) for a in np.arange(-3.14, 3.14, 0.05)
         ]
-        return min(candidates, key=lambda goal: self.policy.distance(self.position, goal))
+        return min(candidates, key=lambda goal: self.policy.error(self.position, goal))
 
     @property
     def counters(self):
@@ -73,7 +73,7 @@ def moving(robot):
 
 def is_stopped(command, state):
     assert command.state is state
-    assert command.velocity.tolist() == [0.0, 0.0]
+    assert command.value.tolist() == [0.0, 0.0]
     return True
 
 
@@ -95,8 +95,8 @@ def recovers(robot, stay_for=4, reset=False):
             assert command.reasons == ("no goal yet",)
     first, second = robot.tick(goal=FAR_GOAL if reset else None), robot.tick()
     assert first.state is second.state is State.ACTIVE
-    assert np.abs(first.velocity).max() == pytest.approx(2.0 * PERIOD)
-    assert np.abs(second.velocity).max() == pytest.approx(4.0 * PERIOD)
+    assert np.abs(first.value).max() == pytest.approx(2.0 * PERIOD)
+    assert np.abs(second.value).max() == pytest.approx(4.0 * PERIOD)
     return True
 
 
@@ -106,7 +106,7 @@ def recovers(robot, stay_for=4, reset=False):
 @pytest.mark.fault("no joint state yet")
 def test_without_a_state_it_waits_and_sends_nothing(robot):
     for command in (*robot.ticks(20, state=None), robot.tick(state=None, goal=FAR_GOAL)):
-        assert command.velocity is None
+        assert command.value is None
         assert command.state is State.WAITING
         assert command.reasons == ("no joint state yet",)
 
@@ -114,7 +114,7 @@ def test_without_a_state_it_waits_and_sends_nothing(robot):
 @pytest.mark.parametrize("wrong", [{"names": ("a", "b")}, {"position": (math.nan, 0.0)}, {"after": 5.0, "state": None}])
 def test_before_the_first_good_state_it_sends_nothing_whatever_goes_wrong(robot, wrong):
     for command in (robot.tick(state=None), *robot.ticks(10, **wrong), robot.tick(after=-50.0, state=None)):
-        assert command.velocity is None
+        assert command.value is None
         assert command.state is State.WAITING
 
 
@@ -126,7 +126,7 @@ def test_without_a_goal_it_waits_at_zero(robot):
 
 def test_with_a_state_and_a_goal_it_drives_from_zero_through_the_acceleration_limit(robot):
     robot.tick()
-    speeds = [np.abs(robot.tick(goal=FAR_GOAL).velocity).max() for _ in range(10)]
+    speeds = [np.abs(robot.tick(goal=FAR_GOAL).value).max() for _ in range(10)]
     np.testing.assert_allclose(speeds, [0.04, 0.08, 0.12, 0.16, 0.2, 0.24, 0.28, 0.3, 0.3, 0.3], rtol=1e-6)
 
 
@@ -189,7 +189,7 @@ def test_reordered_and_extra_joints_make_no_difference(policy):
     for _ in range(20):
         expected, command = plain.tick(velocity=(0.2, -0.1)), mixed.tick(**changes)
         assert command.state is State.ACTIVE
-        assert command.velocity.tolist() == expected.velocity.tolist()
+        assert command.value.tolist() == expected.value.tolist()
 
 
 # Row: duplicate name, lengths disagree, NaN/inf position.
@@ -213,7 +213,7 @@ MALFORMED = {
 def test_a_malformed_state_is_rejected_counted_and_soon_too_old(moving, kind, bad):
     for command in moving.ticks(5, **bad):
         assert command.state is State.ACTIVE
-        assert command.velocity.any()
+        assert command.value.any()
         assert command.reasons[0].startswith("joint state rejected: ")
     assert is_stopped(moving.tick(**bad), State.HOLD)
     assert moving.counters[f"states rejected: {kind.strip()}"] == 6
@@ -224,7 +224,7 @@ def test_a_malformed_state_is_rejected_counted_and_soon_too_old(moving, kind, ba
 def test_a_state_or_goal_that_is_none_is_rejected(moving, bad):
     command = moving.tick(state=bad, goal=bad)
     assert command.state is State.ACTIVE
-    assert command.velocity.any()
+    assert command.value.any()
     assert [reason.split(" rejected: ")[0] for reason in command.reasons] == ["goal", "joint state"]
     assert moving.counters["states rejected: malformed"] == moving.counters["goals rejected: malformed"] == 1
 
@@ -246,7 +246,7 @@ def test_a_missing_velocity_is_estimated_where_that_is_allowed(policy):
     for each in (robot, knowing):
         each.drive()
     for _ in range(10):
-        assert robot.tick(velocity=(0.0, math.nan)).velocity.tolist() == knowing.tick().velocity.tolist()
+        assert robot.tick(velocity=(0.0, math.nan)).value.tolist() == knowing.tick().value.tolist()
     assert "states rejected: velocity missing" not in robot.counters
 
 
@@ -294,9 +294,9 @@ def test_a_continuous_joint_that_is_counted_from_half_a_turn_to_half_a_turn_does
     robot.position = [angle, 1.0]
     command = robot.tick(goal=FAR_GOAL)
     for _ in range(100):
-        angle += command.velocity[0] * PERIOD
+        angle += command.value[0] * PERIOD
         robot.position = [math.remainder(angle, 2 * math.pi), 1.0]
-        command = robot.tick(velocity=command.velocity)
+        command = robot.tick(velocity=command.value)
         assert command.state is State.ACTIVE
         assert command.reasons == ()
     assert abs(angle) > 3.5
@@ -309,7 +309,7 @@ def test_after_any_number_of_turns_it_drives_as_after_none(policy, turns):
     for robot in (turned, unturned):
         robot.tick(goal=FAR_GOAL)
     for _ in range(30):
-        np.testing.assert_allclose(turned.tick().velocity, unturned.tick().velocity, atol=1e-3)
+        np.testing.assert_allclose(turned.tick().value, unturned.tick().value, atol=1e-3)
 
 
 # Row: position beyond its limit.
@@ -325,7 +325,7 @@ def test_beyond_a_limit_it_moves_slowly_inward_and_not_outward(robot, side):
         command = robot.ticks(30)[-1]
         assert command.state is State.ACTIVE
         inward = -side * push > 0
-        np.testing.assert_allclose(command.velocity, [0.025, push * 0.05] if inward else [0.025, 0.0], atol=1e-9)
+        np.testing.assert_allclose(command.value, [0.025, push * 0.05] if inward else [0.025, 0.0], atol=1e-9)
 
 
 def test_at_a_limit_outward_motion_stops_at_once(robot):
@@ -333,7 +333,7 @@ def test_at_a_limit_outward_motion_stops_at_once(robot):
     robot.position = [0.0, 2.4]
     robot.tick(goal=FAR_GOAL)
     command = robot.ticks(20)[-1]
-    assert command.velocity.tolist() == pytest.approx([0.0, 0.3])
+    assert command.value.tolist() == pytest.approx([0.0, 0.3])
     assert command.reasons == ()
     robot.position = [0.0, 2.51]
     for command in robot.ticks(3):
@@ -373,9 +373,9 @@ def test_an_arm_that_is_not_heard_of_for_a_while_stays_within_its_limits(policy,
     command = robot.tick(goal=FAR_GOAL)
     heard = True
     while command.state is State.ACTIVE:
-        robot.position[1] += command.velocity[1] * PERIOD
+        robot.position[1] += command.value[1] * PERIOD
         heard &= robot.position[1] < 2.6 - margin - 1e-3
-        command = robot.tick(velocity=command.velocity) if heard else robot.tick(state=None)
+        command = robot.tick(velocity=command.value) if heard else robot.tick(state=None)
     assert is_stopped(command, State.HOLD)
     assert 2.6 - margin < robot.position[1] <= 2.6
 
@@ -398,9 +398,9 @@ def test_a_bad_goal_is_rejected_counted_and_the_old_one_stays(policy, kind, bad)
         each.drive()
     command = robot.tick(goal=bad)
     assert command.reasons[0].startswith("goal rejected: ")
-    assert command.velocity.tolist() == undisturbed.tick().velocity.tolist()
+    assert command.value.tolist() == undisturbed.tick().value.tolist()
     assert robot.counters[f"goals rejected: {kind}"] == 1
-    assert robot.controller.snapshot()["goal"] == FAR_GOAL.position
+    assert robot.controller.snapshot()["goal"] == FAR_GOAL.value
     assert robot.tick().reasons == ()
 
 
@@ -420,7 +420,7 @@ def test_an_unreachable_goal_is_projected_onto_the_reachable_ones_where_that_is_
     robot.drive()
     command = robot.tick(goal=Goal([0.0, 4.0], "base"))
     assert command.reasons == ("goal out of reach: [0.0, 0.53] is the nearest in reach",)
-    assert command.velocity.any()
+    assert command.value.any()
     assert robot.controller.snapshot()["goal"] == [0.0, 0.53]
     assert robot.tick(goal=FAR_GOAL).reasons == ()
     assert robot.counters["goals projected"] == 1
@@ -452,7 +452,7 @@ def test_a_policy_that_fails_now_and_then_is_no_fault_and_starts_from_zero_each_
         for command in moving.ticks(2):
             assert is_stopped(command, State.ACTIVE)
         moving.policy.trouble = None
-        assert np.abs(moving.tick().velocity).max() == pytest.approx(2.0 * PERIOD)
+        assert np.abs(moving.tick().value).max() == pytest.approx(2.0 * PERIOD)
     assert "faults: policy" not in moving.counters
 
 
@@ -465,25 +465,25 @@ def test_after_a_reset_failures_of_the_policy_are_counted_anew(moving):
         assert is_stopped(moving.tick(), state)
 
 
-def test_a_distance_that_raises_is_a_failure_of_the_policy(moving, monkeypatch):
-    def distance(*arguments):
+def test_an_error_that_raises_is_a_failure_of_the_policy(moving, monkeypatch):
+    def error(*arguments):
         raise RuntimeError("gone")
 
-    monkeypatch.setattr(moving.policy, "distance", distance)
+    monkeypatch.setattr(moving.policy, "error", error)
     for state in (State.ACTIVE, State.ACTIVE, State.FAULT):
         assert is_stopped(moving.tick(), state)
     assert moving.counters["policy failures: exception"] == 3
 
 
-@pytest.mark.parametrize("failure", DISTANCES)
-def test_a_distance_that_cannot_be_is_counted_and_does_not_leave_a_reached_goal(robot, failure):
+@pytest.mark.parametrize("failure", ERRORS)
+def test_an_error_that_cannot_be_is_counted_and_does_not_leave_a_reached_goal(robot, failure):
     robot.tick(goal=Goal(robot.tip(), "base"))
     robot.policy.trouble = failure
     for command in robot.ticks(2):
         assert is_stopped(command, State.REACHED)
-        assert command.reasons[0].startswith("the policy gave the distance ")
+        assert command.reasons[0].startswith("the policy gave the error ")
     assert is_stopped(robot.tick(), State.FAULT)
-    assert robot.counters["policy failures: distance"] == 3
+    assert robot.counters["policy failures: error"] == 3
 
 
 @pytest.mark.parametrize(
@@ -506,7 +506,7 @@ def test_a_command_beyond_the_policy_s_range_is_clamped_and_counted(moving):
     moving.policy.trouble = lambda command: np.array([1e6, -1.0])
     command = moving.ticks(30)[-1]
     assert command.state is State.ACTIVE
-    np.testing.assert_allclose(command.velocity, [0.3, -0.15])  # of [2, -1]
+    np.testing.assert_allclose(command.value, [0.3, -0.15])  # of [2, -1]
     assert command.reasons == ("the policy's command was beyond its range",)
     assert moving.counters["commands clamped"] == 30
 
@@ -520,13 +520,13 @@ def test_a_late_update_is_zero_for_that_tick_and_nothing_is_caught_up(moving):
     assert is_stopped(command, State.ACTIVE)
     assert command.reasons == ("update came after 0.062 s, 3.1 periods",)
     assert moving.counters["late updates"] == 1
-    speeds = [np.abs(moving.tick().velocity).max() for _ in range(3)]
+    speeds = [np.abs(moving.tick().value).max() for _ in range(3)]
     np.testing.assert_allclose(speeds, [0.04, 0.08, 0.12], rtol=1e-6)
 
 
 def test_an_update_within_three_periods_is_not_late_and_accelerates_as_one_period_would(robot):
     robot.tick(goal=FAR_GOAL)
-    speeds = [np.abs(robot.tick(after=2.9 * PERIOD).velocity).max() for _ in range(3)]
+    speeds = [np.abs(robot.tick(after=2.9 * PERIOD).value).max() for _ in range(3)]
     np.testing.assert_allclose(speeds, [0.08, 0.12, 0.16], rtol=1e-6)
     assert "late updates" not in robot.counters
 
@@ -534,11 +534,11 @@ def test_an_update_within_three_periods_is_not_late_and_accelerates_as_one_perio
 def test_updates_that_come_faster_than_the_rate_accelerate_no_faster(robot):
     robot.tick(goal=FAR_GOAL)
     for _ in range(30):
-        before = robot.controller.snapshot()["velocity"]
-        change = robot.tick(after=0.002).velocity - before
+        before = robot.controller.snapshot()["command"]
+        change = robot.tick(after=0.002).value - before
         assert np.abs(change).max() <= 2.0 * 0.002 + 1e-9
     frozen = robot.tick(after=0.0, state=None)
-    assert frozen.velocity.tolist() == robot.controller.snapshot()["velocity"]
+    assert frozen.value.tolist() == robot.controller.snapshot()["command"]
 
 
 def test_a_late_update_at_a_reached_goal_does_not_leave_it(robot):
@@ -573,7 +573,7 @@ def test_after_a_jump_of_the_clock_it_recovers_with_states_stamped_by_another_cl
     assert is_stopped(tick(jump), State.HOLD)  # the state that comes with it does not count
     for _ in range(4):
         assert is_stopped(tick(), State.HOLD)
-    assert np.abs(tick().velocity).max() == pytest.approx(0.04)
+    assert np.abs(tick().value).max() == pytest.approx(0.04)
 
 
 def test_the_position_that_comes_with_a_late_update_is_taken_but_does_not_count_for_recovery(moving):
@@ -587,7 +587,7 @@ def test_the_position_that_comes_with_a_late_update_is_taken_but_does_not_count_
 @pytest.mark.fault("clock jumps backwards or far ahead, or stands still")
 def test_a_clock_that_stands_still_holds_from_the_third_further_update_on(moving):
     for _ in range(2):
-        assert moving.tick(after=0.0, state=None).velocity.any()
+        assert moving.tick(after=0.0, state=None).value.any()
     stamp = moving.now
     for tick in range(20):
         command = moving.tick(after=0.0, stamp=stamp + (tick + 1) * PERIOD)
@@ -601,7 +601,7 @@ def test_a_clock_that_stands_still_holds_from_the_third_further_update_on(moving
 
 def test_updates_two_or_three_at_a_time_are_no_clock_that_stands_still(moving):
     for after in (0.0, 0.0, PERIOD) * 10:
-        assert moving.tick(after=after, state=None if not after else DEFAULT).velocity.any()
+        assert moving.tick(after=after, state=None if not after else DEFAULT).value.any()
 
 
 def test_holds_are_counted_once_each_however_long_they_last(moving):
@@ -681,7 +681,7 @@ def test_an_emergency_stop_before_the_first_state_sends_zeros(robot):
     assert is_stopped(robot.tick(state=None), State.ESTOP)
     robot.controller.reset()
     command = robot.tick(state=None)
-    assert command.velocity is None
+    assert command.value is None
     assert command.state is State.WAITING
 
 
@@ -732,7 +732,7 @@ def test_a_reset_at_a_reached_goal_forgets_that_it_was_reached(robot):
     robot.controller.emergency_stop()
     robot.controller.reset()
     robot.ticks(5)
-    while robot.policy.distance(robot.position, goal) < 0.06:
+    while robot.policy.error(robot.position, goal) < 0.06:
         robot.position[0] += 0.01
         robot.tick()
     assert robot.tick(goal=Goal(goal, "base")).state is State.ACTIVE  # between one and one and a half tolerances
@@ -743,7 +743,7 @@ def test_a_reset_without_need_changes_nothing(policy):
     for each in (robot, untouched):
         each.drive()
     robot.controller.reset()
-    assert robot.tick().velocity.tolist() == untouched.tick().velocity.tolist()
+    assert robot.tick().value.tolist() == untouched.tick().value.tolist()
 
 
 # Interlocks.
@@ -765,19 +765,19 @@ def test_an_interlock_stops_the_arm_at_once_without_a_fault_and_without_asking_t
 
 def test_without_interlocks_it_goes_on_from_zero_to_the_goal_that_it_had(moving):
     moving.ticks(10, interlocks=INTERLOCKS)
-    assert moving.controller.snapshot()["goal"] == FAR_GOAL.position
+    assert moving.controller.snapshot()["goal"] == FAR_GOAL.value
     assert recovers(moving, stay_for=0)
 
 
 def test_an_interlock_and_a_missing_goal_are_both_named(robot):
     assert robot.tick(interlocks=INTERLOCKS).reasons == (*INTERLOCKS, "no goal yet")
     assert robot.tick(interlocks=INTERLOCKS, goal=FAR_GOAL).reasons == INTERLOCKS
-    assert robot.tick().velocity.any()
+    assert robot.tick().value.any()
 
 
 def test_before_the_first_state_an_interlock_sends_nothing(robot):
     command = robot.tick(state=None, goal=FAR_GOAL, interlocks=INTERLOCKS)
-    assert command.velocity is None
+    assert command.value is None
     assert command.state is State.WAITING
 
 
@@ -803,7 +803,7 @@ def test_a_hold_ends_during_an_interlock(moving):
 def test_a_reached_goal_is_still_reached_after_an_interlock(robot):
     robot.tick(goal=Goal(robot.tip(), "base"))
     goal = robot.controller.snapshot()["goal"]
-    while robot.policy.distance(robot.position, goal) < 0.06:  # between one and one and a half tolerances
+    while robot.policy.error(robot.position, goal) < 0.06:  # between one and one and a half tolerances
         robot.position[0] += 0.01
         assert is_stopped(robot.tick(interlocks=INTERLOCKS), State.WAITING)
     assert is_stopped(robot.tick(), State.REACHED)
@@ -818,13 +818,13 @@ def test_without_its_goal_it_waits_at_once_for_a_new_one(moving):
         assert is_stopped(command, State.WAITING)
         assert command.reasons == ("no goal yet",)
     assert moving.controller.snapshot()["goal"] is None
-    assert np.abs(moving.tick(goal=FAR_GOAL).velocity).max() == pytest.approx(2.0 * PERIOD)
+    assert np.abs(moving.tick(goal=FAR_GOAL).value).max() == pytest.approx(2.0 * PERIOD)
 
 
 def test_a_reached_goal_that_is_forgotten_and_said_again_is_not_yet_reached(robot):
     goal = Goal(robot.tip(), "base")
     robot.tick(goal=goal)
-    while robot.policy.distance(robot.position, goal.position) < 0.06:
+    while robot.policy.error(robot.position, goal.value) < 0.06:
         robot.position[0] += 0.01
         assert is_stopped(robot.tick(), State.REACHED)
     robot.controller.forget_goal()
@@ -853,11 +853,11 @@ def configure(robot, **values):
 
 
 def test_a_lower_velocity_holds_at_once_and_keeps_the_direction_and_a_higher_one_is_accelerated_to(moving):
-    before = moving.tick().velocity
+    before = moving.tick().value
     configure(moving, max_velocity=0.1)
-    np.testing.assert_allclose(moving.tick().velocity, before / 3, atol=1e-3)
+    np.testing.assert_allclose(moving.tick().value, before / 3, atol=1e-3)
     configure(moving, max_velocity=0.2, max_acceleration=1.0)
-    speeds = [np.abs(moving.tick().velocity).max() for _ in range(6)]
+    speeds = [np.abs(moving.tick().value).max() for _ in range(6)]
     np.testing.assert_allclose(speeds, [0.12, 0.14, 0.16, 0.18, 0.2, 0.2], rtol=1e-6)
     assert moving.controller.config.max_velocity == 0.2
 
@@ -886,7 +886,7 @@ def test_a_wider_margin_stops_outward_motion_at_once(robot):
     robot.policy.trouble = lambda command: np.array([0.0, 2.0])
     robot.position = [0.0, 2.4]
     robot.tick(goal=FAR_GOAL)
-    assert robot.ticks(10)[-1].velocity[1] > 0.2
+    assert robot.ticks(10)[-1].value[1] > 0.2
     configure(robot, limit_margin=0.21)
     assert is_stopped(robot.tick(), State.ACTIVE)
 
@@ -896,7 +896,7 @@ def test_other_limits_change_nothing_else(policy):
     for each in (robot, untouched):
         each.drive()
     configure(robot)
-    assert robot.tick().velocity.tolist() == untouched.tick().velocity.tolist()
+    assert robot.tick().value.tolist() == untouched.tick().value.tolist()
     for each in (robot, untouched):
         each.ticks(6, state=None)
     configure(robot)
@@ -913,7 +913,7 @@ def test_limits_that_do_not_fit_the_robot_are_refused_and_those_of_before_stay(m
     assert moving.controller.config == ControllerConfig(**LENIENT)
     for arguments in (*({},) * 3, *({"state": None},) * 6, *({},) * 6):
         ours, theirs = moving.tick(**arguments), undisturbed.tick(**arguments)
-        assert (ours.velocity.tolist(), ours.state) == (theirs.velocity.tolist(), theirs.state)
+        assert (ours.value.tolist(), ours.state) == (theirs.value.tolist(), theirs.state)
 
 
 # Reached.
@@ -934,7 +934,7 @@ def test_a_reached_goal_is_left_only_at_one_and_a_half_tolerances(robot):
     for offset in [*np.arange(0.0, 0.3, 0.01), *np.arange(0.3, 0.0, -0.01)]:  # away, and back
         robot.position = [0.5 + offset, 1.0]
         states.append(robot.tick().state)
-        distances.append(robot.policy.distance(robot.position, goal))
+        distances.append(robot.policy.error(robot.position, goal))
     reached = True
     for state, distance in zip(states, distances, strict=True):
         reached = distance < (0.075 if reached else 0.05)
@@ -946,11 +946,11 @@ def test_a_reached_goal_is_left_only_at_one_and_a_half_tolerances(robot):
 def test_between_one_and_one_and_a_half_tolerances_it_stands_until_the_goal_moves_by_a_tenth(robot, moved, state):
     x, y = robot.tip()
     robot.tick(goal=Goal([x, y], "base"))
-    while robot.policy.distance(robot.position, [x, y]) < 0.06:
+    while robot.policy.error(robot.position, [x, y]) < 0.06:
         robot.position[0] += 0.01
         assert is_stopped(robot.tick(goal=Goal([x, y], "base")), State.REACHED)
     for goal in ([x + moved, y], [x, y + moved]):
-        if 0.055 < robot.policy.distance(robot.position, goal) < 0.07:
+        if 0.055 < robot.policy.error(robot.position, goal) < 0.07:
             break
     assert robot.tick(goal=Goal(goal, "base")).state is state
     assert robot.controller.snapshot()["goal"] == goal
@@ -981,7 +981,7 @@ def test_the_snapshot_is_plain_and_tells_state_reasons_and_counters(robot):
     assert snapshot["last_hold"] == "the last joint state is 0.140 s old"
     assert snapshot["joint_state_age"] == pytest.approx(0.14)
     assert snapshot["recovery_states_needed"] == 5
-    assert snapshot["goal"] == FAR_GOAL.position
+    assert snapshot["goal"] == FAR_GOAL.value
     assert snapshot["velocity"] == [0.0, 0.0]
     assert snapshot["policy_sha256"] == robot.policy.sha256
     counters = snapshot["counters"]
@@ -1000,11 +1000,11 @@ def test_commands_can_be_compared_and_kept_in_sets(moving):
 def test_what_it_gives_away_does_not_lead_back_inside(moving, policy):
     undisturbed = Robot(policy)
     undisturbed.drive()
-    moving.tick().velocity[:] = 99.0
+    moving.tick().value[:] = 99.0
     undisturbed.tick()
     snapshot = moving.controller.snapshot()
     snapshot["goal"][0], snapshot["counters"]["updates"] = 99.0, -1
-    assert moving.tick().velocity.tolist() == undisturbed.tick().velocity.tolist()
+    assert moving.tick().value.tolist() == undisturbed.tick().value.tolist()
     assert moving.counters == undisturbed.counters
 
 
@@ -1032,7 +1032,7 @@ def test_it_brings_the_simulated_arm_to_at_least_9_of_10_goals_within_its_limits
             goal = Goal(simulation.goal[row].astype(float), "base") if tick == 0 else None
             command = controller.update(tick * PERIOD, state, goal)
             reached[row] |= command.state is State.REACHED
-            commands[row] = command.velocity
+            commands[row] = command.value
         assert (np.abs(commands) <= 0.3 + 1e-9).all()
         assert (np.abs(commands - last)[commands != 0] <= 2.0 * PERIOD + 1e-9).all()
         last = commands

@@ -588,7 +588,7 @@ def test_the_same_inputs_give_the_same_outputs_bit_for_bit(policy, real):
         elif kind == "update":
             inputs, troubled_policy.trouble, *expected = entry
             command = controller.update(*inputs)
-            velocity = None if command.velocity is None else command.velocity.tobytes()
+            velocity = None if command.value is None else command.value.tobytes()
             assert [velocity, command.state, command.reasons] == expected
         else:
             getattr(controller, kind)(*entry)

@@ -48,7 +48,7 @@ class Arm:
         self.position = self.position + velocity * PERIOD
         values = self.show(names=NAMES, position=self.position, velocity=velocity, stamp=self.now)
         command = self.controller.update(self.now, JointState(**values), goal, interlocks)
-        self.commands.append(np.zeros(2) if command.velocity is None else command.velocity)
+        self.commands.append(np.zeros(2) if command.value is None else command.value)
         return command
 
     def run(self, seconds, goal=None):
@@ -60,9 +60,9 @@ class Arm:
     def fault(self, goal=FAR_GOAL):
         """Drive until a fault; return how long it took from the first command on, and what was said."""
         commands = self.run(2.0, goal)
-        began = next(tick for tick, command in enumerate(commands) if command.velocity is not None)
+        began = next(tick for tick, command in enumerate(commands) if command.value is not None)
         assert commands[-1].state is State.FAULT, commands[-1]
-        assert commands[-1].velocity.tolist() == [0.0, 0.0]
+        assert commands[-1].value.tolist() == [0.0, 0.0]
         return next(t for t, c in enumerate(commands) if c.state is State.FAULT) * PERIOD - began * PERIOD, (
             commands[-1].reasons[-1]
         )
@@ -220,7 +220,7 @@ def test_velocities_that_contradict_positions_are_refused_and_hold(policy, joint
     arm.show = lambda velocity, **values: values | {"velocity": one(joint, change)(velocity)}
     commands = arm.run(0.6, FAR_GOAL)
     held = next(command for command in commands if command.state is State.HOLD)
-    assert held.velocity.tolist() == [0.0, 0.0]
+    assert held.value.tolist() == [0.0, 0.0]
     assert held.reasons[0].startswith(f"joint state rejected: '{NAMES[joint]}' reports velocities for ")
     assert arm.counters["states rejected: velocity inconsistent"] == 1
 
@@ -312,7 +312,7 @@ def simulate(policy, reacher, robots, seconds, randomization, seed, change=None)
                 angle, radius = draw.uniform(-3.1, 3.1), draw.uniform(0.31, 0.52)
                 goal = Goal([radius * math.cos(angle), radius * math.sin(angle)], "base")
             state = JointState(NAMES, position[row].tolist(), velocity[row].tolist(), tick * PERIOD)
-            commands[row] = controller.update(tick * PERIOD, state, goal).velocity
+            commands[row] = controller.update(tick * PERIOD, state, goal).value
         for _ in range(2):
             sent = np.concatenate([commands[None], sent[:-1]])
             physics.step(sent[late, np.arange(robots)])

@@ -23,17 +23,20 @@ class Analytic:
     def __init__(self, metadata):
         self.metadata, self.sha256 = metadata, ""
 
-    def distance(self, position, goal):
+    def error(self, position, goal):
         q1, q2 = position.tolist()
         x, y = 0.3 * math.cos(q1) + 0.25 * math.cos(q1 + q2), 0.3 * math.sin(q1) + 0.25 * math.sin(q1 + q2)
-        return math.hypot(x - goal[0], y - goal[1])
+        return np.array([math.hypot(x - goal[0], y - goal[1])])
 
-    def __call__(self, position, velocity, goal):
+    def __call__(self, position, velocity, goal, *last_command):
         x, y = goal.tolist()
         cosine = (x * x + y * y - 0.1525) / 0.15
         elbow = math.acos(min(1.0, max(-1.0, cosine)))
         shoulder = math.atan2(y, x) - math.atan2(0.25 * math.sin(elbow), 0.3 + 0.25 * math.cos(elbow))
-        return np.clip(4.0 * (np.array([shoulder, elbow]) - position), -2.0, 2.0).astype(np.float32)
+        velocity = np.clip(4.0 * (np.array([shoulder, elbow]) - position), -2.0, 2.0)
+        if last_command:
+            return (last_command[0] + PERIOD * velocity).astype(np.float32)
+        return velocity.astype(np.float32)
 
 
 class Motion:
@@ -133,7 +136,7 @@ class World:
         self.controller = Controller(self.policy, config, self.policy.stopwatch)
         self.policy.stop = self.controller.emergency_stop
         self._take_config(config)
-        self.tolerance = policy.metadata.goal_tolerance
+        self.tolerance = policy.metadata.tolerances[0].value
         self.lower, self.upper = policy.metadata.position_limit.T.tolist()
         self.turns = [math.isinf(upper) for upper in self.upper]
         self.strongest = policy.metadata.effort_limit.tolist()
@@ -223,7 +226,7 @@ class World:
         policy.forget()
         command = self.controller.update(now, state, goal, interlocks)
         if self.log is not None:
-            velocity = None if command.velocity is None else command.velocity.tobytes()
+            velocity = None if command.value is None else command.value.tobytes()
             inputs = (now, state, goal, interlocks)
             self.log.append(("update", inputs, policy.trouble, velocity, command.state, command.reasons))
         stop, elapsed = self._take_time(now)
@@ -247,9 +250,9 @@ class World:
         assert said.count("joint state") == refused
         self._see_age(now, command.reasons, said)
         # The state that follows.
-        velocity = STILL if command.velocity is None else command.velocity.tolist()
+        velocity = STILL if command.value is None else command.value.tolist()
         unheard = min(self.heard) == -math.inf
-        assert (command.velocity is None) == (unheard and not self.latched)
+        assert (command.value is None) == (unheard and not self.latched)
         if self.latched:
             expected = self.latched
         elif unheard:
@@ -341,7 +344,7 @@ class World:
         return elapsed > 3 * PERIOD, min(elapsed, PERIOD)
 
     def _take_goal(self, goal):
-        numbers, verdict = tuple(float(number) for number in goal.position), "taken"
+        numbers, verdict = tuple(float(number) for number in goal.value), "taken"
         if len(numbers) != 2 or not all(map(math.isfinite, numbers)) or goal.frame != "base":
             return "rejected"
         radius = math.hypot(*numbers)
