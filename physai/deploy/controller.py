@@ -99,7 +99,7 @@ class Controller:
         self._limits = VelocityLimits(self.policy.metadata, config)
         self._following = Following(self.policy.metadata, config)
         # A lower velocity holds at once, whatever the acceleration limit: the margin may be too narrow for another.
-        self._last = self._last * min(1.0, config.max_velocity / max(np.abs(self._last).max(), 1e-9))
+        self._last = self._limits.scaled(self._last)
         self._check_position()
 
     def update(
@@ -155,7 +155,8 @@ class Controller:
             value, self._last, self._memory = self._interface.stand(position), self._zeros, self._nothing
         else:
             velocity, self._memory = motion
-            value, self._last = self._interface.drive(velocity, position, elapsed)
+            value, went = self._interface.drive(velocity, position, elapsed)
+            self._last = self._limits.scaled(went)  # a position may have been taken along by the arm, and faster
         unheard = state is State.WAITING and self._received == -math.inf
         self._command = Command(None if unheard or value is None else value.copy(), state, tuple(reasons))
         return self._command

@@ -102,7 +102,7 @@ class PositionInterface:
         highest = np.minimum(self._max_lead, np.maximum(self._upper - position, 0.0))
         ahead = np.minimum(np.maximum(lead + velocity * elapsed, lowest), highest)
         self._target, self._driving = position + ahead, True
-        return self._target, (ahead - lead) / elapsed if elapsed > 0 else np.zeros_like(velocity)
+        return self._target, (ahead - lead) / elapsed if elapsed > 0 else velocity
 
     def stand(self, position: np.ndarray) -> np.ndarray | None:
         """See :class:`CommandInterface`."""

@@ -40,6 +40,11 @@ class VelocityLimits:
         """Whether this is more than the policy was trained to ask for (with room for rounding)."""
         return bool((np.abs(wanted) > self._command * _ROOM).any())
 
+    def scaled(self, velocity: np.ndarray) -> np.ndarray:
+        """Return velocities [n], rad/s, slowed down to the largest that is allowed, in their direction."""
+        largest = np.abs(velocity).max()
+        return velocity * (self._max_velocity / largest) if largest > self._max_velocity else velocity
+
     def apply(
         self, wanted: np.ndarray, position: np.ndarray, last: np.ndarray, elapsed: float
     ) -> tuple[np.ndarray, str | None]:

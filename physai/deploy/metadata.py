@@ -245,7 +245,7 @@ def _check_signals(inputs: tuple[Signal, ...], outputs: tuple[Signal, ...], join
         raise PolicyError("metadata: the names of inputs and outputs must be distinct")
     command, *memory = outputs
     if command.quantity not in _COMMANDS or command.name != f"{command.quantity.value}_command":
-        raise PolicyError("metadata: the first output must be a command of joint velocities or positions")
+        raise PolicyError("metadata: the first of outputs must be a command of joint velocities or positions")
     wanted: dict[str, Quantity | None] = {"joint_position": Quantity.JOINT_POSITION, GOAL: None}
     wanted["joint_velocity"] = Quantity.JOINT_VELOCITY
     if command.quantity is Quantity.JOINT_POSITION:
@@ -256,7 +256,8 @@ def _check_signals(inputs: tuple[Signal, ...], outputs: tuple[Signal, ...], join
             raise PolicyError(f"metadata: inputs must hold '{name}'" + (f", a {quantity.value}" if quantity else ""))
     for signal in (command, *(by_name[name] for name, quantity in wanted.items() if quantity)):
         if signal.shape != (len(joints),) or signal.labels != joints:
-            raise PolicyError(f"metadata: '{signal.name}' must have one number for each of {list(joints)}")
+            side = "outputs" if signal is command else "inputs"
+            raise PolicyError(f"metadata: {side}: '{signal.name}' must have one number for each of {list(joints)}")
     sizes = [one.size for one in (*memory, *(signal for signal in inputs if signal.name == MEMORY))]
     if memory and not ([one.name for one in memory] == [NEW_MEMORY] and len(sizes) == 2 and sizes[0] == sizes[1]):
         raise PolicyError(f"metadata: a policy that remembers takes '{MEMORY}' and gives as much '{NEW_MEMORY}'")

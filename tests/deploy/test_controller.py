@@ -969,7 +969,7 @@ def test_the_snapshot_is_plain_and_tells_state_reasons_and_counters(robot):
     snapshot = robot.controller.snapshot()
     assert snapshot["state"] == "waiting"
     assert snapshot["joint_state_age"] is None
-    assert snapshot["velocity"] is None
+    assert snapshot["command"] is None
     assert snapshot["goal"] is None
     assert snapshot["counters"] == {}
     robot.drive()
@@ -982,7 +982,7 @@ def test_the_snapshot_is_plain_and_tells_state_reasons_and_counters(robot):
     assert snapshot["joint_state_age"] == pytest.approx(0.14)
     assert snapshot["recovery_states_needed"] == 5
     assert snapshot["goal"] == FAR_GOAL.value
-    assert snapshot["velocity"] == [0.0, 0.0]
+    assert snapshot["command"] == [0.0, 0.0]
     assert snapshot["policy_sha256"] == robot.policy.sha256
     counters = snapshot["counters"]
     assert counters["updates"] == 28

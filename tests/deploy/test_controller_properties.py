@@ -553,7 +553,8 @@ SEEDS, UPDATES = range(8), 126_000
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", SEEDS)
-def test_a_million_updates_keep_the_contract(policy, seed):
+def test_a_million_updates_keep_the_contract(policy, position_policy, seed):
+    policy = (policy, position_policy)[seed % 2]
     # The real one needs twice the time, and what is tested is the controller.
     analytic = Analytic(policy.metadata)
     seen = drive([analytic] if seed else [policy, analytic, analytic], seed, UPDATES)

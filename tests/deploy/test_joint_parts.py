@@ -278,7 +278,7 @@ def test_beyond_a_limit_it_is_slow_at_once_and_keeps_its_direction_however_littl
     robot.policy.trouble = lambda command: np.array([2.0, -1.0])
     robot.position = [0.0, 2.59]
     robot.tick(goal=FAR_GOAL)
-    before = robot.ticks(300)[-1].velocity
+    before = robot.ticks(300)[-1].value
     np.testing.assert_allclose(
         before, [0.6 if acceleration < 1 else 1.0, -0.3 if acceleration < 1 else -0.5], rtol=0.01
     )

@@ -264,7 +264,7 @@ def test_a_memory_that_is_spoilt_from_outside_never_moves_the_arm(robot):
     robot.controller._memory = np.full(SIZE, math.nan, np.float32)
     command = robot.tick()
     assert command.value.tolist() == [0.0, 0.0]
-    assert "the policy gave a velocity that is not finite" in command.reasons
+    assert "the policy gave a command that is not finite" in command.reasons
     assert not robot.asked_next().any()
 
 
