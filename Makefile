@@ -63,7 +63,7 @@ format: $(VENV)/.installed-dev  ## Format the code
 	$(BIN)/ruff check --fix .
 
 docs: $(VENV)/.installed-docs  ## Build the documentation's site into build/docs
-	$(BIN)/python -m mkdocs build --strict $(ARGS)
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict $(ARGS)
 	@echo "==> The site: build/docs/index.html"
 
 build: $(VENV)/.installed-dev  ## Build a wheel and try it in an empty environment, from another folder

@@ -43,6 +43,11 @@ def on_page_markdown(markdown: str, **_: Any) -> str:
     return _ASKED.sub(made, markdown)
 
 
+def on_page_content(html: str, **_: Any) -> str:
+    """Take the roles of Sphinx out of docstrings: ``:func:`x` `` becomes ``x``."""
+    return re.sub(r":(?:attr|class|func|meth|mod):<code>~?", "<code>", html)
+
+
 def parameter_class(name: str) -> type[Parameters]:
     """The dataclass of a controller or node."""
     module, _, kind = PARAMETERS[name].rpartition(".")
@@ -99,7 +104,11 @@ def _allowed(field: "dataclasses.Field[Any]") -> str:
         return " or ".join(f"`{choice}`" for choice in choices)
     if type(field.default) not in (int, float):
         return ""
-    return f"{low:g} to {high:g}" if math.isfinite(high) else f"from {low:g}"
+    return f"{_number(low)} to {_number(high)}" if math.isfinite(high) else f"from {_number(low)}"
+
+
+def _number(value: float) -> str:
+    return f"{int(value):,}" if float(value).is_integer() else f"{value:g}"
 
 
 def _file(path: Any) -> str:
