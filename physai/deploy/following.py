@@ -9,7 +9,7 @@ from physai.deploy.metadata import Metadata
 from physai.deploy.parameters import ControllerConfig
 
 # What healthy arms need, measured on simulated ones of randomization=strong (delays of 60 ms, gains of 0.3, encoder
-# noise of 5 mrad), and with 50 ms of delay more: README, "An arm that does not follow".
+# noise of 5 mrad), and with 50 ms of delay more: docs/faults.md, "An arm that does not follow".
 _DELAY = 0.16  # s; measured motion may be that of commands up to so much older
 _FLOOR = 0.015  # rad
 _PROGRESS = 0.1  # tolerances

@@ -57,7 +57,7 @@ class InferenceConfig(ControllerConfig):
 
 
 class InferenceNode(StoppableNode):
-    """A thin shell of ROS around :class:`physai.deploy.Controller`; the README lists its topics and services.
+    """A thin shell of ROS around :class:`physai.deploy.Controller`; docs/ros2.md lists its topics and services.
 
     Raises:
         UserError: If a parameter or the policy file is wrong.
