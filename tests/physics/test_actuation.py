@@ -22,6 +22,11 @@ def delays(env, td):
     return td["physics_parameters"][:, env.simulation.layout.columns["actuator_delay"]][:, 0].long()
 
 
+def follow(prompt, delayed):
+    """Put robots into the states of others."""
+    prompt.simulation.physics.set_state(delayed.simulation.physics.state())
+
+
 def test_a_command_moves_the_robot_exactly_as_many_steps_late_as_its_delay(pair):
     delayed, prompt = pair
     td = delayed.reset()
@@ -31,7 +36,7 @@ def test_a_command_moves_the_robot_exactly_as_many_steps_late_as_its_delay(pair)
     since = torch.zeros(ROBOTS, dtype=torch.int64)  # step of each robot's last reset
     given = []
     late = delays(delayed, td)
-    prompt.simulation.set_state(delayed.simulation.state())
+    follow(prompt, delayed)
     for step in range(60):
         if step in (7, 8, 20, 41):
             rows = torch.rand(ROBOTS, 1, generator=generator) < 0.4
@@ -40,7 +45,7 @@ def test_a_command_moves_the_robot_exactly_as_many_steps_late_as_its_delay(pair)
             late, before = delays(delayed, td), late
             assert torch.equal(late[~rows[:, 0]], before[~rows[:, 0]])
             since[rows[:, 0]] = step
-            prompt.simulation.set_state(delayed.simulation.state())
+            follow(prompt, delayed)
         given.append(2 * torch.rand(ROBOTS, 2, generator=generator) - 1)
         arriving = torch.zeros(ROBOTS, 2)
         for robot in range(ROBOTS):
