@@ -122,6 +122,7 @@ class DeployablePolicy(TensorDictModuleBase):
     def __init__(self, pipeline: Any, inputs: Sequence[Signal], outputs: Sequence[Signal]) -> None:
         super().__init__()
         self.pipeline = pipeline
+        self.eval()
         self.inputs, self.outputs = tuple(inputs), tuple(outputs)
         self.in_keys, self.out_keys = [signal.name for signal in inputs], [signal.name for signal in outputs]
         self.memory_size = self.outputs[-1].size if self.out_keys[-1] == NEW_MEMORY else 0
