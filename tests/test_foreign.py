@@ -252,17 +252,6 @@ def test_a_pickle_for_hydra_is_not_read(run, monkeypatch, capsys):
     assert "pickle" in refused(capsys, train.main)
 
 
-def test_a_write_never_follows_a_link(tmp_path):
-    from physai.training.checkpoint import write
-
-    (tmp_path / "other").write_text("untouched")
-    for name in ("file", ".file.tmp"):
-        (tmp_path / name).symlink_to(tmp_path / "other")
-    write(tmp_path / "file", b"new")
-    assert (tmp_path / "file").read_text() == "new"
-    assert (tmp_path / "other").read_text() == "untouched"
-
-
 def test_links_within_a_run_folder_stay(run):
     (run / "latest").symlink_to("checkpoints")
     assert load_config(run).seed == 0

@@ -18,7 +18,7 @@ from torchrl.collectors import MultiCollector, _runner
 from physai.collectors.worker import MakeEnv, NormalizedPolicy, WorkerCollector
 from physai.envs.make import TransformedRobotEnv
 from physai.errors import UserError
-from physai.forked import follow, signals_wait
+from physai.processes import follow, signals_wait
 from physai.transforms.normalization import Normalizer
 
 

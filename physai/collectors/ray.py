@@ -21,6 +21,7 @@ from torchrl.collectors.distributed import RayCollector
 from physai.collectors.worker import MakeEnv, NormalizedPolicy, WorkerCollector
 from physai.config import nearest
 from physai.errors import UserError
+from physai.processes import SIGNALS, kill_with_this
 from physai.transforms.normalization import Normalizer
 
 _START_SECONDS = 60  # for a cluster that may be busy
@@ -81,7 +82,8 @@ class RobotRayCollector(RayCollector):
                         f"{ray.cluster_resources().get('CPU', 0):.0f}"
                     )
                 ray.get(ready)
-            self._watcher = _watch(_descendants(os.getpid()) - others)
+            if started := _descendants(os.getpid()) - others:
+                self._watcher = kill_with_this(started)  # most notice by themselves, two take a minute
         except BaseException:
             ray.shutdown()
             raise
@@ -139,7 +141,7 @@ def _start_ray(arguments: dict[str, Any], workers: int) -> None:
     # Signals to a terminal or a container reach Ray's processes, too, which inherit that they wait: the learner says
     # what comes of them. It keeps its own handler: Ray sets one.
     handler = signal.getsignal(signal.SIGTERM)
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, _SIGNALS)
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
     try:
         ray.init(**arguments)
     except Exception as error:  # Ray asserts, too
@@ -149,17 +151,6 @@ def _start_ray(arguments: dict[str, Any], workers: int) -> None:
     finally:
         signal.signal(signal.SIGTERM, handler)
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
-
-
-_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)
-
-
-def _watch(started: set[int]) -> "subprocess.Popen[bytes] | None":
-    """Start what kills Ray's processes when the learner is killed: most notice by themselves, two take a minute."""
-    if not started:
-        return None
-    command = ["sh", "-c", f"read _; kill -9 {' '.join(map(str, started))} 2> /dev/null"]  # read ends with the learner
-    return subprocess.Popen(command, stdin=subprocess.PIPE, start_new_session=True)
 
 
 def _descendants(process: int) -> set[int]:

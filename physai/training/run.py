@@ -18,6 +18,7 @@ from physai.config import validate
 from physai.envs.make import TransformedRobotEnv
 from physai.envs.simulation import EnvConfig
 from physai.errors import UserError
+from physai.files import write_atomically
 from physai.physics import RandomizationConfig
 from physai.seeding import derive
 from physai.training import checkpoint
@@ -73,6 +74,7 @@ def run_training(
         except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
             raise UserError(f"{done}: the run's summary is damaged") from None
         return summary
+<<<<<<< HEAD
     agent = agent or Agent.build(config)
     with contextlib.closing(agent), stop_signals() as stop:
         for name in config.randomization.without_effect(agent.env.simulation.layout):
@@ -87,6 +89,17 @@ def run_training(
         result = TrainedPolicy(run_dir, "best", config=config).evaluate(config.evaluation.episodes)
         summary = _summary(config, trainer, evaluation.best_frames, result)
         checkpoint.write(done, json.dumps(summary, indent=2).encode())
+=======
+    with stop_signals() as stop:
+        agent, clock = train(config, run_dir, resume, stop, agent)
+        print(f"Judging the best policy on {config.evaluation.episodes:,} goals it has never seen ...", flush=True)
+        try:
+            result = TrainedPolicy(run_dir, "best", config=config).evaluate(config.evaluation.episodes)
+            summary = _summary(config, agent, clock, result)
+        finally:
+            agent.close()
+        write_atomically(done, json.dumps(summary, indent=2).encode())
+>>>>>>> 894c684 (Files that are whole or not there, and processes that end with their parent, each in a module of their own)
         from physai.plotting import plot_runs  # no frame needs to wait for Matplotlib
 
         try:

@@ -5,7 +5,6 @@ it, and it ends with its input.
 """
 
 import contextlib
-import ctypes
 import importlib
 import json
 import os
@@ -18,9 +17,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from physai.processes import die_with
 from tests.ros.peer import Process, node_command, wait_for
-
-_PR_SET_PDEATHSIG = 1
 
 
 class Forge:
@@ -154,7 +152,7 @@ def _report(*_: Any) -> None:
 
 
 def _become(order: dict[str, Any]) -> None:
-    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+    die_with(os.getppid())
     os.setsid()
     signal.signal(signal.SIGCHLD, signal.SIG_DFL)
     log = os.open(order["log"], os.O_WRONLY | os.O_APPEND)
