@@ -74,7 +74,6 @@ def run_training(
         except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
             raise UserError(f"{done}: the run's summary is damaged") from None
         return summary
-<<<<<<< HEAD
     agent = agent or Agent.build(config)
     with contextlib.closing(agent), stop_signals() as stop:
         for name in config.randomization.without_effect(agent.env.simulation.layout):
@@ -88,18 +87,7 @@ def run_training(
         print(f"Evaluating the best policy on {config.evaluation.episodes:,} goals it has never seen ...", flush=True)
         result = TrainedPolicy(run_dir, "best", config=config).evaluate(config.evaluation.episodes)
         summary = _summary(config, trainer, evaluation.best_frames, result)
-        checkpoint.write(done, json.dumps(summary, indent=2).encode())
-=======
-    with stop_signals() as stop:
-        agent, clock = train(config, run_dir, resume, stop, agent)
-        print(f"Judging the best policy on {config.evaluation.episodes:,} goals it has never seen ...", flush=True)
-        try:
-            result = TrainedPolicy(run_dir, "best", config=config).evaluate(config.evaluation.episodes)
-            summary = _summary(config, agent, clock, result)
-        finally:
-            agent.close()
         write_atomically(done, json.dumps(summary, indent=2).encode())
->>>>>>> 894c684 (Files that are whole or not there, and processes that end with their parent, each in a module of their own)
         from physai.plotting import plot_runs  # no frame needs to wait for Matplotlib
 
         try:

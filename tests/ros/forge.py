@@ -151,8 +151,8 @@ def _report(*_: Any) -> None:
         os.write(1, f"ended {pid} {os.waitstatus_to_exitcode(status)}\n".encode())
 
 
-def _become(order: dict[str, Any]) -> None:
-    die_with(os.getppid())
+def _become(order: dict[str, Any], forge: int) -> None:
+    die_with(forge)
     os.setsid()
     signal.signal(signal.SIGCHLD, signal.SIG_DFL)
     log = os.open(order["log"], os.O_WRONLY | os.O_APPEND)
@@ -166,13 +166,14 @@ def _become(order: dict[str, Any]) -> None:
 
 def _forge() -> None:
     importlib.import_module("physai.ros.inference_node")
+    forge = os.getpid()
     signal.signal(signal.SIGCHLD, _report)
     for line in iter(sys.stdin.readline, ""):
         signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGCHLD])  # "started" comes first
         pid = os.fork()
         if not pid:
             signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGCHLD])
-            _become(json.loads(line))
+            _become(json.loads(line), forge)
         os.write(1, f"started {pid}\n".encode())
         signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGCHLD])
 
