@@ -38,16 +38,19 @@ def _play(node: DictConfig, _: Path) -> None:
     import torch
     from torchrl.envs.utils import ExplorationType, set_exploration_type
 
+    from physai.envs.viewing import make_viewer
+    from physai.envs.viewing import show as show_robot
+
     config = validate(PlayConfig, node)
     actor, env = config.load().deploy(1, config.seed)
     human = config.render == "human"
-    viewer = env.simulation.viewer(window=human)
+    viewer = make_viewer(env.simulation, window=human)
     dt = env.simulation.config.control_dt
     frames: list[np.ndarray] = []
 
     def show(times: int = 1) -> None:
         for _ in range(times):
-            image = viewer.show(env.simulation.joint_position[0], env.simulation.goal[0])
+            image = show_robot(viewer, env.simulation)
             if image is None:
                 time.sleep(dt)
             else:
@@ -61,8 +64,8 @@ def _play(node: DictConfig, _: Path) -> None:
             while not tensordict["done"].any():
                 tensordict = env.step(actor(tensordict))["next"]
                 show()
-            reached += int(tensordict["terminated"])
-            outcome = "reached" if tensordict["terminated"] else "missed"
+            reached += int(tensordict["success"])
+            outcome = "reached" if tensordict["success"] else "missed"
             print(f"goal {goal + 1}: {outcome} in {tensordict['episode_length'].item() * dt:.2f} s")
             show(_PAUSE)
     print(f"{reached} of {config.goals} goals reached")

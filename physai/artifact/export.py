@@ -15,8 +15,8 @@ from physai.deploy import Metadata, PolicyError, load_policy
 from physai.deploy.archive import content_sha256
 from physai.deploy.metadata import metadata_sha256
 from physai.deploy.policy import load_module
+from physai.files import write_atomically
 from physai.seeding import derive
-from physai.training.checkpoint import write
 from physai.training.config import TrainConfig
 from physai.training.run import TrainedPolicy, git_commit
 
@@ -56,21 +56,21 @@ def export_policy(
     actor, env = trained.deploy(_ROBOTS, SEED)
     try:
         policy = make_deployable(actor, env)
-        rollout, extremes = roll_out(actor, env), extreme_states(env, policy.memory_size)
-        work = States(*(rollout.get(key) for key in policy.in_keys))
-        states = States(*map(torch.cat, zip(work, extremes, strict=True)))
-        tried = f"{len(rollout):,} states of its work, {len(extremes.goal):,} extremes"
+        rollout, extremes = roll_out(actor, env), extreme_states(policy, env)
+        work = States({key: rollout.get(key) for key in policy.in_keys})
+        states = States({key: torch.cat([work[key], extremes[key]]) for key in policy.in_keys})
+        tried = f"{len(work):,} states of its work, {len(extremes):,} extremes"
         gate.check_against_env(policy, actor, env, rollout, states)
         report("the artifact is the policy", f"{tried}: equal to the last bit")
 
         scripted = script(policy)
         content = save(scripted)
         loaded = load_module(content, policy.in_keys)
-        expected = gate.answers(policy, states)
+        expected = gate.answers(policy, policy, states)
         for stage, found in (
-            ("TorchScript is not the artifact", gate.answers(scripted, states)),
-            ("the loaded file is not the artifact", gate.answers(loaded, states)),
-            ("a fresh process disagrees", gate.ask_fresh_process(content, states)),
+            ("TorchScript is not the artifact", gate.answers(scripted, policy, states)),
+            ("the loaded file is not the artifact", gate.answers(loaded, policy, states)),
+            ("a fresh process disagrees", gate.ask_fresh_process(content, policy, states)),
         ):
             gate.compare_answers(stage, found, expected, states)
         report("TorchScript, also in a fresh process", "equal to the last bit")
@@ -78,40 +78,40 @@ def export_policy(
         converted = onnx.convert(policy, states) if "onnx" in formats else None
         tolerance = gate.onnx_tolerance(policy, expected, states)
         if converted is not None:
-            worst = gate.check_onnx(onnx.Runtime(converted), expected, states, tolerance)
-            report("ONNX in ONNX Runtime", f"within {worst:.1e} rad/s")
+            worst = gate.check_onnx(onnx.Runtime(converted), policy, expected, states, tolerance)
+            report("ONNX in ONNX Runtime", f"within {worst:.1e} {policy.outputs[0].unit}")
 
         if policy.memory_size:
             forms: dict[str, tuple[gate.Function, float]] = {"the artifact": (policy, 0.0), "the file": (loaded, 0.0)}
             if converted is not None:
                 forms["ONNX Runtime"] = (onnx.Runtime(converted), tolerance)
-            worst = gate.check_recurrence(forms, gate.acting(actor, env), work)
+            worst = gate.check_recurrence(forms, gate.acting(actor, env), policy, work)
             others = f", ONNX within {worst:.1e}" if converted is not None else ""
-            report("remembers as the policy does", f"over {len(rollout):,} steps: to the last bit{others}")
+            report("remembers as the policy does", f"over {len(work):,} steps: to the last bit{others}")
 
-        driven = gate.check_drive(content, actor, env, episodes, SEED)
+        driven = gate.check_drive(content, policy, actor, env, episodes, SEED)
         report(f"drives {episodes:,} episodes", f"reaches {driven.success_rate:.1%} of the goals, as the policy does")
 
         described = {
             **describe.describe_origin(git_commit()),
-            **describe.describe_robot(env.simulation, policy.memory_size),
+            **describe.describe_robot(env.simulation, policy),
             "checkpoint": {"which": which, "frames": trained.frames},
             "evaluation": {**driven.summary(), "episodes": episodes, "randomization": trained.randomization.name},
             "config": trained.config.model_dump(mode="json"),
-            "golden": describe.golden_pairs(states, gate.split(expected, states), GOLDEN_PAIRS),
+            "golden": describe.golden_pairs(states, expected, GOLDEN_PAIRS),
             "content_sha256": content_sha256(content),
         }
         described["metadata_sha256"] = metadata_sha256(described)
         text = json.dumps(described, allow_nan=False)
         final = save(scripted, text)
         metadata = _load_as_a_robot_would(final)
-        gate.check_metadata(metadata, env.simulation, expected)
+        gate.check_metadata(metadata, env.simulation, policy, expected)
         if converted is not None:
             final_onnx = onnx.describe(converted, text)
-            gate.check_onnx(onnx.Runtime(final_onnx), expected, states, tolerance)
+            gate.check_onnx(onnx.Runtime(final_onnx), policy, expected, states, tolerance)
             if onnx.read_metadata(final_onnx) != text:
                 raise gate.GateError("the metadata of the ONNX file is not that of the policy")
-            write(run_dir / FILES["onnx"], final_onnx)
+            write_atomically(run_dir / FILES["onnx"], final_onnx)
         if "torchscript" in formats:
             _publish(run_dir / FILES["torchscript"], final)
         return metadata
@@ -128,7 +128,7 @@ def _load_as_a_robot_would(content: bytes) -> Metadata:
         except PolicyError as error:
             raise gate.GateError(f"the loader refuses the file: {str(error).removeprefix(f'{path}: ')}") from None
     if policy.golden_error:
-        raise gate.GateError(f"the loaded file differs from its golden pairs by {policy.golden_error:.3g} rad/s")
+        raise gate.GateError(f"the loaded file differs from its golden pairs by {policy.golden_error:.3g}")
     return policy.metadata
 
 
@@ -136,5 +136,5 @@ def _publish(path: Path, content: bytes) -> None:
     """Write a policy and its hash; a kill in between leaves a policy without a hash, never one with a wrong hash."""
     beside = path.with_name(f"{path.name}.sha256")
     beside.unlink(missing_ok=True)
-    write(path, content)
-    write(beside, f"{hashlib.sha256(content).hexdigest()}  {path.name}\n".encode())
+    write_atomically(path, content)
+    write_atomically(beside, f"{hashlib.sha256(content).hexdigest()}  {path.name}\n".encode())

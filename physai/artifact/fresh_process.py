@@ -5,7 +5,7 @@ import warnings
 
 
 def main(policy: str, inputs: str, outputs: str) -> None:
-    """Write what ``policy`` gives for each row of ``inputs`` (.npz), and distances, to ``outputs`` (.npy)."""
+    """Write what ``policy`` gives for each row of ``inputs`` (.npz), and errors, to ``outputs`` (.npz)."""
     for name in ("physai", "tensordict", "torchrl"):
         sys.modules[name] = None  # type: ignore[assignment]  # importing them fails from here on
     import numpy as np
@@ -15,14 +15,14 @@ def main(policy: str, inputs: str, outputs: str) -> None:
     torch.set_num_threads(1)
     module = torch.jit.load(policy)
     given = np.load(inputs)
-    columns = [torch.from_numpy(given[key]) for key in given.files]  # joint_position, joint_velocity, goal, memory
+    columns = {key: torch.from_numpy(given[key]) for key in given.files}
     rows = []
-    for index in range(len(columns[0])):
-        row = [column[index : index + 1] for column in columns]
-        answer = module(*row)
+    for index in range(len(given[given.files[0]])):
+        row = {key: column[index : index + 1] for key, column in columns.items()}
+        answer = module(**row)
         answers = answer if isinstance(answer, tuple) else (answer,)
-        rows.append(torch.cat([*answers, module.distance(row[0], row[2])], dim=1))
-    np.save(outputs, torch.cat(rows).numpy())
+        rows.append((*answers, module.error(row["joint_position"], row["goal"])))
+    np.savez(outputs, *(torch.cat(column).numpy() for column in zip(*rows)))  # noqa: B905
 
 
 if __name__ == "__main__":

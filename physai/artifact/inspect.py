@@ -12,6 +12,7 @@ from rich.table import Table
 from physai.artifact import onnx
 from physai.deploy import Metadata, PolicyError, archive, read_metadata
 from physai.errors import UserError
+from physai.signals import Signal
 
 
 def show(path: Path) -> None:
@@ -47,19 +48,17 @@ def _summary(path: Path, metadata: Metadata) -> Table:
     raw = metadata.raw
     evaluation = raw["evaluation"]
     low, high = evaluation["success_ci"]
-    inner, outer = metadata.goal_radius
     rows = {
         "robot": f"{metadata.robot}, end effector {raw['robot']['end_effector']}",
         "URDF SHA-256": raw["robot"]["urdf_sha256"],
-        "inputs": _shapes(raw["inputs"], raw["units"]),
-        "output": _shapes(raw["outputs"], raw["units"]),
+        "inputs": _shapes(metadata.inputs),
+        "outputs": _shapes(metadata.outputs),
         "control rate": f"{metadata.control_rate:g} Hz",
-        "goals": f"in frame '{metadata.goal_frame}', {inner:g} to {outer:g} m from its origin, within "
-        f"{metadata.goal_tolerance:g} m",
+        "goals": _goals(metadata),
         "evaluation": f"{evaluation['success_rate']:.1%} success (95 % interval {low:.1%} to {high:.1%}) on "
         f"{evaluation['episodes']:,} goals, randomization {evaluation['randomization']}",
         "checkpoint": f"{raw['checkpoint']['which']}, {raw['checkpoint']['frames']:,} frames",
-        "golden pairs": str(len(metadata.golden["goal"])),
+        "golden pairs": str(len(metadata.golden[metadata.goal.name])),
         "versions": ", ".join(f"{name} {version}" for name, version in raw["versions"].items()),
         "git commit": str(raw["git_commit"]),
         "created": raw["created"],
@@ -88,7 +87,12 @@ def _joints(metadata: Metadata) -> Table:
     return table
 
 
-def _shapes(shapes: dict[str, list[Any]], units: dict[str, str]) -> str:
-    return ", ".join(
-        f"{key} [{', '.join(map(str, shape))}] {units.get(key, '')}".rstrip() for key, shape in shapes.items()
-    )
+def _shapes(signals: tuple[Signal, ...]) -> str:
+    return ", ".join(f"{signal.name} {list(signal.shape)} {signal.unit}".rstrip() for signal in signals)
+
+
+def _goals(metadata: Metadata) -> str:
+    region = ", ".join(f"{key} {value}" for key, value in vars(metadata.region).items())
+    near = ", ".join(f"{one.name} {one.value:g} {one.unit}" for one in metadata.tolerances)
+    frame = f" in frame '{metadata.goal.frame}'" if metadata.goal.frame else ""
+    return f"{metadata.goal.quantity.value}{frame}, {metadata.region.kind}: {region}; within: {near}"

@@ -1,9 +1,10 @@
-"""Everything between a robot's sensors and its velocity command as one scriptable TensorDictModule."""
+"""Everything between a robot's sensors and its command as one scriptable TensorDictModule."""
 
 import copy
 import io
 import warnings
 import zipfile
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -11,57 +12,120 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
 from physai.deploy.archive import METADATA
-from physai.deploy.metadata import INPUTS, OUTPUT, input_keys, output_keys
+from physai.deploy.metadata import LAST_COMMAND, MEMORY, NEW_MEMORY
 from physai.envs.make import TransformedRobotEnv
+from physai.envs.simulation import Simulation
 from physai.errors import UserError
+from physai.robots import JointCommand
+from physai.signals import Quantity, Signal
+from physai.tasks import ObservationModule
 
 VIEWS = ("observation", "normalized_observation", "features")  # what a policy can see on a robot
 
 
-class Deployable(TensorDictModuleBase):
-    """Kinematics, observation, frozen normalization, network, squashing and scaling.
+def input_signals(simulation: Simulation, memory_size: int = 0) -> tuple[Signal, ...]:
+    """What a policy file takes, in order."""
+    memory = (Signal(MEMORY, Quantity.MEMORY, (memory_size,)),) if memory_size else ()
+    return (*simulation.sensed, *memory)
 
-    It shares no memory with what it was made from, and needs no gradients.
+
+def output_signals(simulation: Simulation, memory_size: int = 0) -> tuple[Signal, ...]:
+    """What it gives, in order."""
+    memory = (Signal(NEW_MEMORY, Quantity.MEMORY, (memory_size,)),) if memory_size else ()
+    return (simulation.spec.joint_command, *memory)
+
+
+class Pipeline(nn.Module):
+    """What all policies have between sensors and command; its subclasses have a method ``act``, which scripts.
+
+    Kinematics, observation, frozen normalization, network and command. It shares no memory with what it was made from,
+    and needs no gradients.
 
     Args:
         observation: The task's observation module.
         normalizer: Normalizes an observation.
-        network: Acts on what it sees, side by side.
-        in_keys: What the network sees, of ``VIEWS``, in order.
-        command_limit: What an action of 1 means, rad/s, [n].
-
-    Raises:
-        UserError: If the policy sees what no robot can tell it.
+        network: Makes actions of what it sees.
+        seen: What the network sees, as places in ``VIEWS``, in order.
+        command: From actions to commands.
+        signature: Names of the inputs; pipelines of one type have the same.
     """
 
-    __jit_unused_properties__ = ("in_keys", "out_keys", "out_keys_source")  # of the base class; they do not script
-    memory_size = 0
+    __constants__ = ["signature"]  # noqa: RUF012  # which makes a type of its own of each
 
     def __init__(
         self,
-        observation: nn.Module,
+        observation: ObservationModule,
         normalizer: nn.Module,
         network: nn.Module,
-        in_keys: list[str],
-        command_limit: Tensor,
+        seen: list[int],
+        command: JointCommand,
+        signature: str,
     ) -> None:
         super().__init__()
-        for key in in_keys:
-            if key not in VIEWS:
-                raise UserError(
-                    f"policy.actor.in_keys: a policy that sees '{key}' cannot be exported, for no robot can tell it; "
-                    f"it can see {', '.join(VIEWS)}"
-                )
-        self.in_keys = list(INPUTS)
-        self.out_keys = [OUTPUT]
         self.observation = copy.deepcopy(observation)
         self.normalizer = copy.deepcopy(normalizer)
         self.network = copy.deepcopy(network)
-        self.seen = [VIEWS.index(key) for key in in_keys]
-        self.command_limit: Tensor
-        self.register_buffer("command_limit", command_limit.clone())
+        self.command = copy.deepcopy(command)
+        self.seen = seen
+        self.signature = signature
         self.requires_grad_(False)
         self.eval()
+
+    @torch.jit.export
+    def views(self, joint_position: Tensor, joint_velocity: Tensor, goal: Tensor) -> list[Tensor]:
+        """What the policy can see, in the order of ``VIEWS``, [N, ...] each."""
+        observation, features = self.observation(joint_position, joint_velocity, goal)
+        return [observation, self.normalizer(observation), features]
+
+    @torch.jit.export
+    def error(self, joint_position: Tensor, goal: Tensor) -> Tensor:
+        """How far the robot is from its goal, one column a tolerance: [N, n] rad and [N, g] to [N, e]."""
+        return self.observation.error(joint_position, goal)
+
+
+class FeedForwardPipeline(Pipeline):
+    """A pipeline whose ``network`` maps what it sees, side by side, to actions in [-1, 1]."""
+
+    @torch.jit.export
+    def act(self, joint_position: Tensor, joint_velocity: Tensor, goal: Tensor, last_command: Tensor) -> Tensor:
+        """Map what the robot senses, the goal and the last command, [N, ...] each, to commands [N, n]."""
+        views = self.views(joint_position, joint_velocity, goal)
+        action = self.network(torch.cat([views[i] for i in self.seen], dim=1))
+        return self.command(action, joint_position, last_command)
+
+
+class RecurrentPipeline(Pipeline):
+    """A pipeline that remembers; its ``network`` also takes a memory, and gives the new one.
+
+    The memory is an input and an output: zeros where an episode begins, and the caller's to keep.
+    """
+
+    @torch.jit.export
+    def act(
+        self, joint_position: Tensor, joint_velocity: Tensor, goal: Tensor, last_command: Tensor, memory: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Map what the robot senses, as without memory, and a memory [N, H] to commands [N, n] and the new memory."""
+        views = self.views(joint_position, joint_velocity, goal)
+        action, new_memory = self.network(torch.cat([views[i] for i in self.seen], dim=1), memory)
+        return self.command(action, joint_position, last_command), new_memory
+
+
+class DeployablePolicy(TensorDictModuleBase):
+    """A pipeline that takes and gives what its signals declare.
+
+    Args:
+        pipeline: What acts, a :class:`Pipeline`.
+        inputs: Signals that it takes, in order.
+        outputs: Signals that it gives, in order.
+    """
+
+    def __init__(self, pipeline: Any, inputs: Sequence[Signal], outputs: Sequence[Signal]) -> None:
+        super().__init__()
+        self.pipeline = pipeline
+        self.eval()
+        self.inputs, self.outputs = tuple(inputs), tuple(outputs)
+        self.in_keys, self.out_keys = [signal.name for signal in inputs], [signal.name for signal in outputs]
+        self.memory_size = self.outputs[-1].size if self.out_keys[-1] == NEW_MEMORY else 0
 
     def __call__(self, *inputs: Any) -> Any:
         """Act on tensors; or on a TensorDict with ``in_keys``, as other TensorDictModules do."""
@@ -71,49 +135,19 @@ class Deployable(TensorDictModuleBase):
         answer = super().__call__(*(tensordict.get(key) for key in self.in_keys))
         return tensordict.update(dict(zip(self.out_keys, as_tuple(answer), strict=True)))
 
-    def views(self, joint_position: Tensor, joint_velocity: Tensor, goal: Tensor) -> list[Tensor]:
-        """What the policy can see, in the order of ``VIEWS``: [N, 2n + 4], the same, and [N, features]."""
-        observation, features = self.observation(joint_position, joint_velocity, goal)
-        return [observation, self.normalizer(observation), features]
+    def forward(self, *inputs: Tensor) -> Tensor | tuple[Tensor, ...]:
+        """Map inputs to outputs, [N, ...] each."""
+        given = dict(zip(self.in_keys, inputs, strict=True))
+        return self.pipeline.act(*(given[name] for name in self.arguments()))
 
-    @torch.jit.export
-    def distance(self, joint_position: Tensor, goal: Tensor) -> Tensor:
-        """Distance of the end effector to the goal, m: [N, n] rad and [N, 2] m to [N, 1]."""
-        distance: Tensor = self.observation.distance(joint_position, goal)  # type: ignore[operator]
-        return distance
+    def arguments(self) -> list[str]:
+        """Inputs by the order in which the pipeline takes them; a velocity command does not ask for the last one."""
+        last_command = LAST_COMMAND if LAST_COMMAND in self.in_keys else self.in_keys[0]
+        return [*self.in_keys[:3], last_command, *([MEMORY] if self.memory_size else [])]
 
-
-class DeployablePolicy(Deployable):
-    """A policy whose ``network`` maps what it sees to actions in [-1, 1]."""
-
-    def forward(self, joint_position: Tensor, joint_velocity: Tensor, goal: Tensor) -> Tensor:
-        """Map positions [N, n] rad, velocities [N, n] rad/s and goals [N, 2] m to velocity commands [N, n], rad/s."""
-        views = self.views(joint_position, joint_velocity, goal)
-        return self.network(torch.cat([views[i] for i in self.seen], dim=1)) * self.command_limit
-
-
-class RecurrentDeployablePolicy(Deployable):
-    """A policy that remembers; its ``network`` maps what it sees and a memory to actions in [-1, 1] and the new memory.
-
-    The memory is an input and an output: zeros where an episode begins, and the caller's to keep.
-
-    Args:
-        memory_size: H.
-        parts: As of :class:`Deployable`.
-    """
-
-    def __init__(self, memory_size: int, *parts: Any) -> None:
-        super().__init__(*parts)
-        self.memory_size = memory_size
-        self.in_keys, self.out_keys = list(input_keys(memory_size)), list(output_keys(memory_size))
-
-    def forward(
-        self, joint_position: Tensor, joint_velocity: Tensor, goal: Tensor, memory: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        """Map what the robot senses, as without memory, and a memory [N, H] to commands [N, n] and the new memory."""
-        views = self.views(joint_position, joint_velocity, goal)
-        action, new_memory = self.network(torch.cat([views[i] for i in self.seen], dim=1), memory)
-        return action * self.command_limit, new_memory
+    def error(self, joint_position: Tensor, goal: Tensor) -> Tensor:
+        """How far the robot is from its goal: [N, n] rad and [N, g] to [N, e]."""
+        return self.pipeline.error(joint_position, goal)
 
 
 def as_tuple(answer: Tensor | tuple[Tensor, ...]) -> tuple[Tensor, ...]:
@@ -121,31 +155,48 @@ def as_tuple(answer: Tensor | tuple[Tensor, ...]) -> tuple[Tensor, ...]:
     return answer if isinstance(answer, tuple) else (answer,)
 
 
-def make_deployable(actor: TensorDictModuleBase, env: TransformedRobotEnv) -> Deployable:
+def make_deployable(actor: TensorDictModuleBase, env: TransformedRobotEnv) -> DeployablePolicy:
     """Put a trained actor and the env that it was trained in together.
 
     Raises:
         UserError: If the policy sees what no robot can tell it.
     """
-    joints = len(env.simulation.spec.joints)
-    limit = torch.full((joints,), env.simulation.config.max_velocity)
-    views = env.simulation.observation, env.normalization.normalizer
-    size = getattr(actor, "memory_size", 0)
-    if size:
-        return RecurrentDeployablePolicy(size, *views, actor.deterministic(), actor.seen_keys, limit)
-    return DeployablePolicy(*views, actor.deterministic(), actor.in_keys, limit)
+    simulation, memory_size = env.simulation, getattr(actor, "memory_size", 0)
+    keys = actor.seen_keys if memory_size else actor.in_keys
+    for key in keys:
+        if key not in VIEWS:
+            raise UserError(
+                f"policy.actor.in_keys: a policy that sees '{key}' cannot be exported, for no robot can tell it; "
+                f"it can see {', '.join(VIEWS)}"
+            )
+    inputs, outputs = input_signals(simulation, memory_size), output_signals(simulation, memory_size)
+    pipeline = (RecurrentPipeline if memory_size else FeedForwardPipeline)(
+        simulation.task.module,
+        env.normalizer,
+        actor.deterministic(),
+        [VIEWS.index(key) for key in keys],
+        simulation.joint_command,
+        ", ".join(signal.name for signal in inputs),
+    )
+    return DeployablePolicy(pipeline, inputs, outputs)
 
 
-def script(policy: Deployable) -> torch.jit.ScriptModule:
-    """Compile to TorchScript.
+def script(policy: DeployablePolicy) -> torch.jit.ScriptModule:
+    """Compile to TorchScript, with a ``forward`` that takes the policy's inputs by name.
 
     Raises:
         UserError: If a part of the policy is no TorchScript; it says what.
     """
+    inputs = ", ".join(f"{name}: Tensor" for name in policy.in_keys)
+    answer = "Tuple[Tensor, Tensor]" if policy.memory_size else "Tensor"
+    call = f"return self.act({', '.join(policy.arguments())})"
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", DeprecationWarning)
-            return torch.jit.script(policy)
+            scripted = torch.jit.script(policy.pipeline)
+            if not hasattr(scripted, "forward"):  # of another policy of this type
+                scripted.define(f"def forward(self, {inputs}) -> {answer}:\n    {call}\n")
+            return scripted
     except Exception as error:  # the compiler's errors have no base class of their own
         reason = " ".join(str(error).split())[:160]
         raise UserError(f"the policy cannot be exported: a part of it is no TorchScript ({reason})") from None

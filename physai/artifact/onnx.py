@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from physai.artifact.module import Deployable
+from physai.artifact.module import DeployablePolicy
 from physai.artifact.states import States
 from physai.deploy.archive import METADATA
 from physai.errors import UserError
@@ -25,7 +25,7 @@ def missing() -> list[str]:
     return [name for name in PACKAGES if importlib.util.find_spec(name) is None]
 
 
-def convert(policy: Deployable, states: States) -> bytes:
+def convert(policy: DeployablePolicy, states: States) -> bytes:
     """Convert a policy, for any number of rows.
 
     Args:
@@ -43,9 +43,9 @@ def convert(policy: Deployable, states: States) -> bytes:
         try:
             program = torch.onnx.export(
                 policy,
-                tuple(value[:2].clone() for value in states),
+                tuple(value[:2].clone() for value in states.values()),
                 dynamo=True,
-                dynamic_shapes=({0: rows},) * len(states),
+                dynamic_shapes=(({0: rows},) * len(policy.in_keys),),
                 input_names=list(policy.in_keys),
                 output_names=list(policy.out_keys),
                 verbose=False,

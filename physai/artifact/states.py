@@ -9,70 +9,42 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from physai.deploy.metadata import INPUTS, MEMORY
+from physai.artifact.module import DeployablePolicy
+from physai.deploy.metadata import LAST_COMMAND, MEMORY
 from physai.envs.make import TransformedRobotEnv
 
 ON_POLICY = 1024
 _STEPS = 64
-_FAR = 10.0  # times the goals' outer radius
+_FAR = 10.0  # times the goals
 _FAST = 100.0  # times the velocity limit
 _TURNS = 4 * torch.pi  # stands for a position limit that does not exist
+_AHEAD = 0.3  # rad; of a last command
 
 
-class States(tuple[Tensor, ...]):
-    """Inputs of a policy, float32: ``joint_position`` [S, n], ``joint_velocity`` [S, n], ``goal`` [S, 2].
+class States(dict[str, Tensor]):
+    """S values of each input of a policy by name, in its order, float32, [S, ...] each."""
 
-    Of a policy that remembers, also ``memory`` [S, H].
-    """
-
-    keys = (*INPUTS, MEMORY)
-
-    def __new__(cls, *columns: Tensor) -> "States":
-        """Put the inputs together, in this order."""
-        return super().__new__(cls, columns)
-
-    @property
-    def joint_position(self) -> Tensor:
-        """[S, n], rad."""
-        return self[0]
-
-    @property
-    def joint_velocity(self) -> Tensor:
-        """[S, n], rad/s."""
-        return self[1]
-
-    @property
-    def goal(self) -> Tensor:
-        """[S, 2], m."""
-        return self[2]
+    def __len__(self) -> int:
+        """S."""
+        return len(next(iter(self.values())))
 
     @property
     def memory_size(self) -> int:
         """H, or 0."""
-        return sum(value.shape[1] for value in self[len(INPUTS) :])
-
-    @property
-    def sensed(self) -> "States":
-        """The same without memory."""
-        return States(*self[: len(INPUTS)])
-
-    def named(self) -> dict[str, Tensor]:
-        """The inputs by name."""
-        return dict(zip(self.keys, self, strict=False))
+        return self[MEMORY].shape[1] if MEMORY in self else 0
 
     def row(self, index: int) -> "States":
         """One state, [1, ...] each."""
-        return States(*(value[index : index + 1] for value in self))
+        return States({key: value[index : index + 1] for key, value in self.items()})
 
     def rows(self) -> Iterable["States"]:
         """All states, one by one."""
-        return map(self.row, range(len(self.goal)))
+        return map(self.row, range(len(self)))
 
     def describe(self, index: int) -> str:
-        """One state in words; of a memory, the first numbers."""
-        return ", ".join(
-            f"{key}={value[index, :8].tolist()}{'...' if key == MEMORY else ''}" for key, value in self.named().items()
-        )
+        """One state in words; of a long value, the first numbers."""
+        shown = {key: value[index] for key, value in self.items()}
+        return ", ".join(f"{key}={v[:8].tolist()}{'...' if len(v) > 8 else ''}" for key, v in shown.items())
 
 
 @torch.no_grad()
@@ -83,16 +55,15 @@ def roll_out(actor: TensorDictModuleBase, env: TransformedRobotEnv) -> TensorDic
     return rollout[torch.linspace(0, len(rollout) - 1, ON_POLICY).long()]
 
 
-def extreme_states(env: TransformedRobotEnv, memory_size: int = 0) -> States:
+def extreme_states(policy: DeployablePolicy, env: TransformedRobotEnv) -> States:
     """Corners of the joint limits, far goals and huge velocities, each with each; memories from empty to full."""
-    spec, (_, outer) = env.simulation.spec, env.simulation.task.goal_region
+    spec, region = env.simulation.spec, env.simulation.task.region
     limits = torch.from_numpy(spec.position_limit).clamp(-_TURNS, _TURNS)
     ends = torch.stack([limits[:, 0], torch.zeros(len(limits)), limits[:, 1]])  # [3, n]
     speed = torch.from_numpy(spec.velocity_limit)
-    speeds = torch.stack([-_FAST * speed, -speed, torch.zeros_like(speed), speed, _FAST * speed])
-    angles = torch.arange(4) * (torch.pi / 2) + 0.3
-    ring = torch.stack([torch.cos(angles), torch.sin(angles)], dim=1) * outer
-    goals = torch.cat([torch.zeros(1, 2), ring, _FAR * ring])
+    speeds = [-_FAST * speed, -speed, torch.zeros_like(speed), speed, _FAST * speed]
+    drawn = torch.from_numpy(region.sample(4, torch.Generator().manual_seed(0)))
+    goals = torch.cat([torch.zeros_like(drawn[:1]), drawn, _FAR * drawn])
     # Corners of all joints would be too many for long arms: all at one end, and one by one.
     poses = [ends[0], ends[1], ends[2]]
     for joint, end in itertools.product(range(len(limits)), (0, 2)):
@@ -101,7 +72,11 @@ def extreme_states(env: TransformedRobotEnv, memory_size: int = 0) -> States:
         poses.append(pose)
     rows = list(itertools.product(poses, speeds, goals))
     sensed = [torch.stack(list(column)).float() for column in zip(*rows, strict=True)]
-    if not memory_size:
-        return States(*sensed)
-    fullness = torch.linspace(-1, 1, 7).repeat(-(-len(rows) // 7))[: len(rows), None]  # [S, 1], empty ones among them
-    return States(*sensed, fullness * torch.ones(memory_size))
+    states = States(zip(policy.in_keys, sensed, strict=False))
+    # From one side to the other, and from empty to full; the middle among them.
+    sweep = torch.linspace(-1, 1, 7).repeat(-(-len(rows) // 7))[: len(rows), None]
+    if LAST_COMMAND in policy.in_keys:
+        states[LAST_COMMAND] = states["joint_position"] + _AHEAD * sweep
+    if policy.memory_size:
+        states[MEMORY] = sweep * torch.ones(policy.memory_size)
+    return states

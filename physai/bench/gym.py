@@ -3,7 +3,6 @@
 import math
 from argparse import Namespace
 from collections.abc import Callable
-from functools import partial
 from typing import Any
 
 import gymnasium
@@ -45,9 +44,9 @@ class HandWrittenReacher(gymnasium.Env[Array, Array]):
         index = {name.decode(): info[0] for info in infos for name in (info[1], info[12])}  # of joints and of links
         self.joints, self.tip = [index[name] for name in spec.joints], index[spec.end_effector]
         self.efforts = spec.effort_limit.tolist()
-        self.max_velocity, self.max_steps = config.max_velocity, config.task["max_steps"]
+        self.limits, self.max_steps = spec.command_limit.tolist(), config.task["max_steps"]
         self.tolerance, self.success_reward = config.task["tolerance"], config.task["success_reward"]
-        self.radius, self.spread = config.task["goal_radius"], config.task["start_spread"]
+        self.radius, self.spread = config.task["goal_radius"], config.start.spread
         self.observation_space = spaces.Box(-np.inf, np.inf, (8,), np.float32)
         self.action_space = spaces.Box(-1.0, 1.0, (2,), np.float32)
 
@@ -63,8 +62,8 @@ class HandWrittenReacher(gymnasium.Env[Array, Array]):
 
     def step(self, action: Array) -> tuple[Array, float, bool, bool, dict[str, Any]]:
         """Apply an action [2] in [-1, 1] for one control period."""
-        for joint, share, effort in zip(self.joints, action.tolist(), self.efforts, strict=True):
-            velocity = share * self.max_velocity
+        for joint, share, limit, effort in zip(self.joints, action.tolist(), self.limits, self.efforts, strict=True):
+            velocity = share * limit
             bullet.setJointMotorControl2(
                 self.arm, joint, bullet.VELOCITY_CONTROL, 0.0, velocity, effort, 0.1, 1.0, 0.0, self.client
             )
@@ -92,7 +91,7 @@ def run(options: Namespace) -> Table:
 
 
 def measure_gym(seed: int) -> tuple[list[float], list[float]]:
-    """Return robot-steps/s of the yardstick and of physai with one robot; and with many, then in one process."""
+    """Return robot-steps/s of the yardstick and of physai, with one robot and with many."""
     from stable_baselines3.common.vec_env import DummyVecEnv  # an extra
 
     config = reacher(seed)
@@ -106,16 +105,13 @@ def measure_gym(seed: int) -> tuple[list[float], list[float]]:
     one.close()
     actions = random.uniform(-1, 1, (STEPS_OF_ALL, ROBOTS, 2)).astype(np.float32)
     dummy = DummyVecEnv([lambda: gymnasium.make(NAME)] * ROBOTS)
-    make_vector = partial(gymnasium.make_vec, NAME, ROBOTS, vectorization_mode="vector_entry_point")
-    vectors = [make_vector(), make_vector(processes=1)]
+    vector = gymnasium.make_vec(NAME, ROBOTS, vectorization_mode="vector_entry_point")
     dummy.seed(seed)
     dummy.reset()
-    for vector in vectors:
-        vector.reset(seed=seed)
-    many = median_speeds(*(_played_by_all(env, actions) for env in (dummy, *vectors)), rounds=ROUNDS)
+    vector.reset(seed=seed)
+    many = median_speeds(*(_played_by_all(env, actions) for env in (dummy, vector)), rounds=ROUNDS)
     dummy.close()
-    for vector in vectors:
-        vector.close()
+    vector.close()
     return single, many
 
 
@@ -148,8 +144,7 @@ def gym_table(single: list[float], many: list[float]) -> Table:
     )
     rows = {
         "one robot": ("PyBullet by hand", single),
-        f"{ROBOTS} robots": ("DummyVecEnv of physai's", many[:2]),
-        f"{ROBOTS} robots, processes=1": ("DummyVecEnv of physai's", many[::2]),
+        f"{ROBOTS} robots": ("DummyVecEnv of physai's", many),
     }
     for robots, (yardstick, (theirs, ours)) in rows.items():
         shown.add_row(robots, yardstick, f"{theirs:,.0f}", f"{ours:,.0f}", f"{ours / theirs:.2f}")

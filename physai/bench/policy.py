@@ -24,7 +24,6 @@ from physai.artifact import FILES, export_policy, onnx
 from physai.artifact.module import make_deployable
 from physai.bench.timing import reacher, table
 from physai.deploy import load_policy
-from physai.deploy.metadata import INPUTS
 from physai.training.run import TrainedPolicy, run_training
 
 FRAMES = 20_480  # what the policy has learnt does not matter
@@ -94,7 +93,7 @@ def _exported(run: Path) -> dict[str, Call]:
 def _forms(run: Path) -> dict[str, Call]:
     actor, env = TrainedPolicy(run, "best").deploy(1, seed=0)
     moment = env.reset()
-    sensed = {key: moment.get(key) for key in INPUTS}
+    sensed = {signal.name: moment.get(signal.name) for signal in env.simulation.sensed}
     size, joints = sum(moment.get(key).shape[-1] for key in actor.in_keys), env.action_spec.shape[-1]
     stock, silent = _stock_actor(size, joints, log_prob=True), _stock_actor(size, joints, log_prob=False)
     seen = TensorDict({"seen": torch.randn(1, size)}, [1])

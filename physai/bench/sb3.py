@@ -36,7 +36,6 @@ class RobotVecEnv(VecEnv):
 
     def __init__(self, robots: RobotVectorEnv, features: bool = False) -> None:
         self.robots, self.simulation, self.features = robots, robots.simulation, features
-        self._turn = np.where(self.simulation.spec.continuous, 2 * np.pi, 0.0).astype(np.float32)
         self._actions: Array = np.zeros(0)
         space = robots.single_observation_space
         assert isinstance(space, spaces.Box)
@@ -73,16 +72,13 @@ class RobotVecEnv(VecEnv):
 
     def _observe(self) -> Array:
         now = self.simulation
-        # The task's module says the same (a test holds them against each other), and takes longer.
-        turns = np.round(now.joint_position / np.float32(2 * np.pi))
-        parts = [now.joint_position - self._turn * turns, now.joint_velocity, now.end_effector, now.goal]
-        return np.concatenate([*parts, self._features()] if self.features else parts, axis=1)
+        return np.concatenate([now.observe(), self._features()], axis=1) if self.features else now.observe()
 
     def _features(self) -> Array:
         now = self.simulation
-        sensed = (torch.from_numpy(value) for value in (now.joint_position, now.joint_velocity, now.goal))
+        sensed = (now.state.joint_position, now.state.joint_velocity, now.goal)
         with torch.no_grad():
-            return now.observation(*sensed)[1].numpy()
+            return now.task.module(*(torch.from_numpy(value).float() for value in sensed))[1].numpy()
 
     def close(self) -> None:
         """Free the simulation."""

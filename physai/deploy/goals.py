@@ -12,12 +12,12 @@ from physai.signals import Signal
 
 @dataclass(frozen=True)
 class Goal:
-    """Where the robot shall go.
+    """What the robot shall do.
 
     Attributes:
-        value: Its numbers, in the unit and order of the policy's goal.
-        frame: Name of the frame of a position; a goal of joints has none.
-        names: What each number is for, such as a joint; with names, the order is free. Empty: in the policy's order.
+        value: Numbers, in the order of the policy's goal signal, or one for each of ``names``.
+        frame: Name of the frame of a goal that is a place; else empty.
+        names: What the numbers belong to, in any order, such as joints; empty where their order says it.
     """
 
     value: Sequence[float]
@@ -34,55 +34,46 @@ class GoalError(Exception):
 
 
 def accept(goal: Goal, metadata: Metadata, project: bool) -> tuple[np.ndarray, bool]:
-    """Check a goal.
-
-    Args:
-        goal: From outside.
-        metadata: Of the policy.
-        project: Whether one out of reach is moved to the nearest in reach.
-
-    Returns:
-        The goal's numbers [g] in the policy's order, and whether they were moved.
+    """Return the goal's numbers in the signal's order, and whether they were moved into the region of goals.
 
     Raises:
-        GoalError: If it has not as many finite numbers as the policy's goals, in their frame, or is out of reach.
+        GoalError: If it is not made of finite numbers, in another frame, or out of reach.
     """
     signal = metadata.goal
     value = to_floats(goal.value) if isinstance(goal, Goal) else None
     if value is None:
-        raise GoalError("malformed", f"it is not {signal.size} numbers")
-    value = _ordered(value, goal.names, signal)
+        raise GoalError("malformed", "it is not made of numbers")
+    if len(names := _names(goal)):
+        value = _in_order(value, names, signal)
+    if value.shape != signal.shape:
+        raise GoalError("malformed", f"it has the shape {list(value.shape)}, not {list(signal.shape)}")
     if not np.isfinite(value).all():
         raise GoalError("not finite", "it is not finite")
     if not isinstance(goal.frame, str):
         raise GoalError("malformed", "its frame is no name")
-    if signal.frame and goal.frame != signal.frame:
+    if goal.frame != signal.frame and signal.frame:
         raise GoalError("wrong frame", f"frame '{goal.frame}' is not '{signal.frame}'")
     if metadata.region.contains(value):
         return value, False
-    nearest = metadata.region.project(value) if project else None
-    if nearest is None or not metadata.region.contains(nearest):  # the nearest of one too far for floats is nowhere
+    projected = metadata.region.project(value) if project else None
+    if projected is None:
         raise GoalError("unreachable", metadata.region.describe(value))
-    return nearest, True
+    return projected, True
 
 
-def _ordered(value: np.ndarray, names: Sequence[str], signal: Signal) -> np.ndarray:
-    """Bring numbers that are named into the order of the signal."""
-    if isinstance(names, str) or not isinstance(names, Sequence) or not all(isinstance(name, str) for name in names):
-        raise GoalError("malformed", "its names are no list of names")
-    if not names:
-        if value.shape != (signal.size,):
-            raise GoalError("malformed", f"it has the shape {list(value.shape)}, not [{signal.size}]")
-        return value
+def _names(goal: Goal) -> tuple[str, ...]:
+    try:
+        names = tuple(goal.names)
+    except TypeError:
+        names = (None,)  # type: ignore[assignment]
+    if not all(isinstance(name, str) for name in names):
+        raise GoalError("malformed", "its names are none")
+    return names
+
+
+def _in_order(value: np.ndarray, names: tuple[str, ...], signal: Signal) -> np.ndarray:
     if value.shape != (len(names),):
-        raise GoalError("malformed", f"it has {len(names)} names for numbers of the shape {list(value.shape)}")
-    if len(set(names)) < len(names):
-        raise GoalError("malformed", "it names a number twice")
-    for what, words in (
-        ("does not name", [label for label in signal.labels if label not in names]),
-        ("has no use for", [name for name in names if name not in signal.labels]),
-    ):
-        if words:
-            labels = list(signal.labels)
-            raise GoalError("malformed", f"it {what} {words[0][:80]!r}; the policy's goals are of {labels}")
+        raise GoalError("malformed", f"{len(names)} names, but values of the shape {list(value.shape)}")
+    if sorted(names) != sorted(signal.labels):
+        raise GoalError("malformed", f"it is for {list(names)}, not {list(signal.labels)}")
     return value[[names.index(label) for label in signal.labels]]

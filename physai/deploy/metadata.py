@@ -1,42 +1,26 @@
-"""What a policy file says about itself: which robot, which signals in which order, within which limits."""
+"""What a policy file says about itself: which robot, in which order and units, within which limits."""
 
 import hashlib
 import json
 import math
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
 
-from physai.deploy import fields
-from physai.deploy.declarations import (
-    describe_region,
-    describe_signal,
-    parse_region,
-    parse_signals,
-    parse_tolerances,
-)
-from physai.deploy.fields import PolicyError, get
+from physai.errors import UserError
 from physai.signals import Quantity, Region, Signal, Tolerance
-
-__all__ = ["Metadata", "PolicyError", "describe_region", "describe_signal"]
+from physai.signals.region import REGIONS
 
 FORMAT = "physai.policy"
 FORMAT_VERSION = 2
-# Inputs that a controller knows. A file needs the joints' positions and a goal; any other is a question of its task.
-JOINT_POSITION, JOINT_VELOCITY, GOAL = "joint_position", "joint_velocity", "goal"
-LAST_COMMAND = "last_command"  # of position commands: the one that was sent last
+GOAL = "goal"
+LAST_COMMAND = "last_command"  # what was sent before: an input of policies that command positions
 MEMORY, NEW_MEMORY = "memory", "new_memory"  # of a policy that remembers: a further input, a further output
-ERROR = "error"  # how far from the goal, in the units of the tolerances; a method of the module
-COMMANDS = (Quantity.JOINT_VELOCITY, Quantity.JOINT_POSITION)
+ERROR = "error"  # how far the robot is from a goal, which the controller asks for
 MAX_PAIRS = 1000
-_KNOWN = {
-    JOINT_POSITION: (Quantity.JOINT_POSITION,),
-    JOINT_VELOCITY: (Quantity.JOINT_VELOCITY,),
-    GOAL: (Quantity.POSITION, Quantity.JOINT_POSITION),
-    LAST_COMMAND: (Quantity.JOINT_POSITION,),
-    MEMORY: (Quantity.MEMORY,),
-}
+MAX_SIZE = 65536  # numbers of a signal
+_COMMANDS = (Quantity.JOINT_VELOCITY, Quantity.JOINT_POSITION)
 # What a controller does not need, but people do.
 _FOR_PEOPLE = {
     "robot.urdf_sha256": str,
@@ -49,6 +33,14 @@ _FOR_PEOPLE = {
 }
 
 
+class PolicyError(UserError):
+    """A policy file that cannot be trusted or does not fit: one line that says why."""
+
+    def __init__(self, message: str) -> None:
+        # It may quote the file: no line breaks, no control characters for the terminal that shows it.
+        super().__init__("".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in message))
+
+
 @dataclass(frozen=True, eq=False)
 class Metadata:
     """The checked part of a policy's metadata; ``raw`` has all of it.
@@ -57,18 +49,18 @@ class Metadata:
         raw: The JSON object.
         robot: Name of the robot.
         joints: Names of the n joints, in the policy's order; the arrays below follow it.
-        home: Where the robot begins, rad, [n].
+        home: Rest pose, rad, [n].
         position_limit: rad, [n, 2]; infinite for continuous joints.
         velocity_limit: rad/s, [n].
         effort_limit: N·m, [n].
-        command_limit: Largest velocity that the policy commands, rad/s, [n]; also where it commands positions.
+        command_limit: How fast an action of 1 moves each joint, rad/s, [n].
         control_rate: Hz.
         inputs: What the policy takes, in order.
-        outputs: What it gives, in order: the command, and what it remembers, if it does.
+        outputs: What it gives, in order; first the command.
         region: Where goals lie.
-        tolerances: How near to a goal is near enough: E errors, each in a unit of its own.
+        tolerances: Errors that count as reached, one for each error that the policy tells.
         golden: Inputs, and the outputs and errors that the policy gave for them when it was exported, by name; float32,
-            [pairs, size], "error" [pairs, E].
+            [pairs, ...].
         content_sha256: Hash of the code and weights that this describes.
     """
 
@@ -90,18 +82,18 @@ class Metadata:
 
     @property
     def goal(self) -> Signal:
-        """The input that says where to go."""
+        """What is asked of the robot."""
         return next(signal for signal in self.inputs if signal.name == GOAL)
 
     @property
     def command(self) -> Signal:
-        """The output that the robot is driven by."""
+        """What the robot is told."""
         return self.outputs[0]
 
     @property
     def memory_size(self) -> int:
-        """How many numbers the policy remembers, H; 0 for most. An episode begins with zeros."""
-        return self.outputs[1].size if len(self.outputs) > 1 else 0
+        """How many numbers the policy remembers from step to step, H; an episode begins with zeros. 0 for most."""
+        return sum(signal.size for signal in self.outputs[1:])
 
     @classmethod
     def parse(cls, text: str) -> "Metadata":
@@ -110,41 +102,78 @@ class Metadata:
         Raises:
             PolicyError: If a part is missing, of the wrong shape, or impossible; it says which.
         """
-        raw = _load(text)
-        joints = fields.texts(get(raw, "robot.joints", list), "robot.joints")
-        if not joints or len(set(joints)) != len(joints):
+        try:
+            raw = json.loads(text, parse_constant=_refuse_constant)
+        except (ValueError, RecursionError) as error:
+            raise PolicyError(f"the metadata is damaged ({str(error)[:80]})") from None
+        if not isinstance(raw, dict) or raw.get("format") != FORMAT:
+            raise PolicyError("the metadata is not that of a physai policy")
+        if raw.get("format_version") is True or raw.get("format_version") != FORMAT_VERSION:
+            raise PolicyError(
+                f"format version {repr(raw.get('format_version'))[:80]}; this physai reads {FORMAT_VERSION}: "
+                "export the policy again with it"
+            )
+        joints = _get(raw, "robot.joints", list)
+        if not joints or not all(isinstance(name, str) for name in joints) or len(set(joints)) != len(joints):
             raise PolicyError("metadata: robot.joints must be distinct names")
         n = len(joints)
-        inputs, outputs = parse_signals(raw, "inputs"), parse_signals(raw, "outputs")
-        _check_signals(inputs, outputs, joints)
-        for key, kind in _FOR_PEOPLE.items():
-            get(raw, key, kind)
-        limits = {key: get(raw, f"limits.{key}", list) for key in ("position", "velocity", "effort", "command")}
+        position = _array(raw, "limits.position", (n, 2), infinite=True)
+        if not (position[:, 0] < position[:, 1]).all():
+            raise PolicyError("metadata: limits.position must be pairs of lower and upper limit")
+        inputs, outputs = _signals(raw, "inputs"), _signals(raw, "outputs")
+        _check_signals(inputs, outputs, tuple(joints))
+        region, tolerances = _region(raw), _tolerances(raw)
         goal = next(signal for signal in inputs if signal.name == GOAL)
-        region = parse_region(raw, "goal.region", goal.size)
-        tolerances = parse_tolerances(raw, "goal.tolerances", goal.unit, region)
+        if goal.shape != (size := len(region.bounds[0]),):
+            raise PolicyError(f"metadata: goal.region has {size} numbers, the goal has the shape {list(goal.shape)}")
+        for key, kind in _FOR_PEOPLE.items():
+            _get(raw, key, kind)
+        pairs = len(_get(raw, f"golden.{outputs[0].name}", list))
+        if not 0 < pairs <= MAX_PAIRS:
+            raise PolicyError(f"metadata: there are {pairs:,} golden pairs, not 1 to {MAX_PAIRS:,}")
+        shapes = {signal.name: (pairs, *signal.shape) for signal in (*inputs, *outputs)}
+        shapes[ERROR] = (pairs, len(tolerances))
         found = cls(
             raw=raw,
-            robot=get(raw, "robot.name", str),
-            joints=joints,
-            home=fields.array(get(raw, "robot.home", list), "robot.home", (n,)),
-            position_limit=_position_limit(limits["position"], n),
-            velocity_limit=fields.positive(limits["velocity"], "limits.velocity", (n,)),
-            effort_limit=fields.positive(limits["effort"], "limits.effort", (n,)),
-            command_limit=fields.positive(limits["command"], "limits.command", (n,)),
-            control_rate=float(fields.positive(get(raw, "control_rate", object), "control_rate", (), 1e4)),
+            robot=_get(raw, "robot.name", str),
+            joints=tuple(joints),
+            home=_array(raw, "robot.home", (n,)),
+            position_limit=position,
+            velocity_limit=_positive(raw, "limits.velocity", (n,)),
+            effort_limit=_positive(raw, "limits.effort", (n,)),
+            command_limit=_positive(raw, "limits.command", (n,)),
+            control_rate=float(_positive(raw, "control_rate", (), 1e4)),
             inputs=inputs,
             outputs=outputs,
             region=region,
             tolerances=tolerances,
-            golden=_golden(raw, {s.name: s.size for s in (*inputs, *outputs)} | {ERROR: len(tolerances)}),
-            content_sha256=get(raw, "content_sha256", str),
+            golden={key: _array(raw, f"golden.{key}", shape, kind=np.float32) for key, shape in shapes.items()},
+            content_sha256=_get(raw, "content_sha256", str),
         )
         if not (found.command_limit <= found.velocity_limit).all():
             raise PolicyError("metadata: limits.command must not be beyond limits.velocity")
-        if get(raw, "metadata_sha256", str) != metadata_sha256(raw):
+        if _get(raw, "metadata_sha256", str) != metadata_sha256(raw):
             raise PolicyError("the metadata is not what was exported (metadata_sha256 differs)")
         return found
+
+
+def describe_signal(signal: Signal) -> dict[str, Any]:
+    """Return a signal as JSON holds it; null stands for a bound that does not exist."""
+    bounds = {key: [x if math.isfinite(x) else None for x in getattr(signal, key)] for key in ("low", "high")}
+    return {
+        **asdict(signal),
+        **bounds,
+        "quantity": signal.quantity.value,
+        "unit": signal.unit,
+        "shape": list(signal.shape),
+        "labels": list(signal.labels),
+    }
+
+
+def describe_region(region: Region) -> dict[str, Any]:
+    """Return a region as JSON holds it."""
+    values = vars(region).items()
+    return {"kind": region.kind} | {key: list(v) if isinstance(v, tuple) else v for key, v in values}
 
 
 def metadata_sha256(raw: dict[str, Any]) -> str:
@@ -153,82 +182,159 @@ def metadata_sha256(raw: dict[str, Any]) -> str:
     return hashlib.sha256(json.dumps(rest, sort_keys=True).encode()).hexdigest()
 
 
-def command_name(quantity: Quantity) -> str:
-    """What the output is called that commands a quantity."""
-    return f"{quantity.value}_command"
+def _get(raw: dict[str, Any], key: str, kind: type) -> Any:
+    value: Any = raw
+    for part in key.split("."):
+        if isinstance(value, list) and part.isdigit():
+            value = value[int(part)]
+        elif isinstance(value, dict) and part in value:
+            value = value[part]
+        else:
+            raise PolicyError(f"metadata: {key} is missing")
+    if not isinstance(value, kind):
+        raise PolicyError(f"metadata: {key} must be a {kind.__name__}")
+    return value
 
 
-def _load(text: str) -> dict[str, Any]:
+def _signals(raw: dict[str, Any], side: str) -> tuple[Signal, ...]:
+    listed = _get(raw, side, list)
+    if not 0 < len(listed) <= 32:
+        raise PolicyError(f"metadata: {side} must be a list of signals")
+    return tuple(_signal(raw, f"{side}.{number}") for number in range(len(listed)))
+
+
+def _signal(raw: dict[str, Any], key: str) -> Signal:
+    name, quantity = _get(raw, f"{key}.name", str), _get(raw, f"{key}.quantity", str)
+    if not name.isidentifier() or len(name) > 100:
+        raise PolicyError(f"metadata: {key}.name must be an identifier, not {name!r:.80}")
+    if quantity not in [known.value for known in Quantity]:
+        raise PolicyError(f"metadata: {key}.quantity: this physai does not know {quantity!r:.80}")
+    shape = _get(raw, f"{key}.shape", list)
+    if not shape or len(shape) > 8 or not all(type(length) is int and 0 < length <= MAX_SIZE for length in shape):
+        raise PolicyError(f"metadata: {key}.shape must be positive integers")
+    size = math.prod(shape)
+    if size > MAX_SIZE:
+        raise PolicyError(f"metadata: {key} has {size:,} numbers, more than {MAX_SIZE:,}")
+    low, high = (
+        _bounds(raw, f"{key}.{end}", size, stands_for) for end, stands_for in (("low", -math.inf), ("high", math.inf))
+    )
+    labels = _get(raw, f"{key}.labels", list)
+    if len(labels) not in (0, size) or not all(isinstance(label, str) for label in labels):
+        raise PolicyError(f"metadata: {key}.labels must be {size} names, or none")
+    frame = _get(raw, f"{key}.frame", str)
+    signal = Signal(name, Quantity(quantity), tuple(shape), low, high, tuple(labels), frame)
+    if _get(raw, f"{key}.unit", str) != signal.unit:
+        raise PolicyError(f"metadata: {key}.unit must be '{signal.unit}'")
+    if not (signal.bounds[0] <= signal.bounds[1]).all():
+        raise PolicyError(f"metadata: {key}.low must not be above {key}.high")
+    return signal
+
+
+def _bounds(raw: dict[str, Any], key: str, size: int, infinite: float) -> tuple[float, ...]:
+    listed = _get(raw, key, list)
+    if not listed:
+        return ()
+    values = _array(raw, key, (size,), nothing=infinite)
+    return tuple(values.tolist())
+
+
+def _check_signals(inputs: tuple[Signal, ...], outputs: tuple[Signal, ...], joints: tuple[str, ...]) -> None:
+    """See that a robot's policy takes and gives what a robot's policy must."""
+    names = [signal.name for signal in (*inputs, *outputs)]
+    if len(set(names)) != len(names) or ERROR in names:
+        raise PolicyError("metadata: the names of inputs and outputs must be distinct")
+    command, *memory = outputs
+    if command.quantity not in _COMMANDS or command.name != f"{command.quantity.value}_command":
+        raise PolicyError("metadata: the first of outputs must be a command of joint velocities or positions")
+    wanted: dict[str, Quantity | None] = {"joint_position": Quantity.JOINT_POSITION, GOAL: None}
+    wanted["joint_velocity"] = Quantity.JOINT_VELOCITY
+    if command.quantity is Quantity.JOINT_POSITION:
+        wanted[LAST_COMMAND] = Quantity.JOINT_POSITION
+    by_name = {signal.name: signal for signal in inputs}
+    for name, quantity in wanted.items():
+        if name not in by_name or quantity not in (None, by_name[name].quantity):
+            raise PolicyError(f"metadata: inputs must hold '{name}'" + (f", a {quantity.value}" if quantity else ""))
+    for signal in (command, *(by_name[name] for name, quantity in wanted.items() if quantity)):
+        if signal.shape != (len(joints),) or signal.labels != joints:
+            side = "outputs" if signal is command else "inputs"
+            raise PolicyError(f"metadata: {side}: '{signal.name}' must have one number for each of {list(joints)}")
+    sizes = [one.size for one in (*memory, *(signal for signal in inputs if signal.name == MEMORY))]
+    if memory and not ([one.name for one in memory] == [NEW_MEMORY] and len(sizes) == 2 and sizes[0] == sizes[1]):
+        raise PolicyError(f"metadata: a policy that remembers takes '{MEMORY}' and gives as much '{NEW_MEMORY}'")
+    if not memory and sizes:
+        raise PolicyError(f"metadata: there is '{MEMORY}' among the inputs, and no '{NEW_MEMORY}' among the outputs")
+
+
+def _region(raw: dict[str, Any]) -> Region:
+    told = dict(_get(raw, "goal.region", dict))
+    kind = told.pop("kind", None)
+    if not isinstance(kind, str) or kind not in REGIONS:
+        raise PolicyError(f"metadata: goal.region.kind: this physai does not know {kind!r:.80}")
+    if len(told) > 16 or not all(_all_numbers(value) and value is not None for value in told.values()):
+        raise PolicyError("metadata: goal.region must hold numbers")
     try:
-        raw = json.loads(text, parse_constant=_refuse_constant)
-    except (ValueError, RecursionError) as error:
-        raise PolicyError(f"the metadata is damaged ({str(error)[:80]})") from None
-    if not isinstance(raw, dict) or raw.get("format") != FORMAT:
-        raise PolicyError("the metadata is not that of a physai policy")
-    if raw.get("format_version") is True or raw.get("format_version") != FORMAT_VERSION:
-        raise PolicyError(
-            f"format version {repr(raw.get('format_version'))[:80]}; this physai reads {FORMAT_VERSION}: "
-            "export the policy again with it"
+        with np.errstate(over="ignore"):
+            fields: dict[str, Any] = {
+                key: tuple(map(float, v)) if isinstance(v, list) else float(v) for key, v in told.items()
+            }
+        return REGIONS[kind](**fields)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise PolicyError(f"metadata: goal.region: {' '.join(str(error).split())[:120]}") from None
+
+
+def _tolerances(raw: dict[str, Any]) -> tuple[Tolerance, ...]:
+    listed = _get(raw, "goal.tolerances", list)
+    if not 0 < len(listed) <= 1000:
+        raise PolicyError("metadata: goal.tolerances must be a list of tolerances")
+    return tuple(
+        Tolerance(
+            _get(raw, f"goal.tolerances.{number}.name", str),
+            _get(raw, f"goal.tolerances.{number}.unit", str),
+            float(_positive(raw, f"goal.tolerances.{number}.value", ())),
         )
-    return raw
+        for number in range(len(listed))
+    )
+
+
+def _array(
+    raw: dict[str, Any],
+    key: str,
+    shape: tuple[int, ...],
+    infinite: bool = False,
+    kind: type = np.float64,
+    nothing: float | None = None,
+) -> np.ndarray:
+    value = _get(raw, key, object)
+    try:
+        if not _all_numbers(value):
+            raise TypeError
+        with np.errstate(over="ignore"):
+            array: np.ndarray = np.array(value, dtype=np.float64).astype(kind)
+    except (TypeError, ValueError, OverflowError, RecursionError):
+        raise PolicyError(f"metadata: {key} must hold numbers") from None
+    if array.shape != shape:
+        raise PolicyError(f"metadata: {key} must have the shape {list(shape)}, not {list(array.shape)}")
+    if infinite:  # JSON has no infinity: null stands for a limit that does not exist
+        array = np.where(np.isnan(array), np.array([-math.inf, math.inf]), array)
+    elif nothing is not None:
+        array = np.where(np.isnan(array), nothing, array)
+    elif not np.isfinite(array).all():
+        raise PolicyError(f"metadata: {key} must be finite")
+    return array
+
+
+def _all_numbers(value: Any) -> bool:
+    if isinstance(value, list):
+        return all(map(_all_numbers, value))
+    return value is None or (isinstance(value, int | float) and not isinstance(value, bool))
 
 
 def _refuse_constant(name: str) -> None:
     raise ValueError(f"{name} is no JSON")
 
 
-def _check_signals(inputs: tuple[Signal, ...], outputs: tuple[Signal, ...], joints: tuple[str, ...]) -> None:
-    """See that signals are called what they are, and are those of these joints."""
-    names = [signal.name for signal in (*inputs, *outputs)] + [ERROR]
-    if len(set(names)) != len(names):
-        raise PolicyError(f"metadata: inputs and outputs must have distinct names, none of them '{ERROR}'")
-    for needed in (JOINT_POSITION, GOAL):
-        if needed not in names[: len(inputs)]:
-            raise PolicyError(f"metadata: inputs must have '{needed}'")
-    command = outputs[0]
-    if command.quantity not in COMMANDS or command.name != command_name(command.quantity):
-        raise PolicyError(f"metadata: outputs must begin with {' or '.join(map(command_name, COMMANDS))}")
-    known = _KNOWN | {command.name: (command.quantity,)}
-    for signal in (*inputs, command):
-        quantities = known.get(signal.name)
-        if quantities is None:
-            continue  # of a task that a later controller may know
-        if signal.quantity not in quantities:
-            raise PolicyError(
-                f"metadata: '{signal.name}' must be of the quantity {' or '.join(each.value for each in quantities)}"
-            )
-        of_joints = signal.quantity in COMMANDS and signal.name != GOAL  # a goal may be of some joints
-        if of_joints and (signal.shape, signal.labels) != ((len(joints),), joints):
-            raise PolicyError(f"metadata: '{signal.name}' must have a number for each of robot.joints, in their order")
-        if len(signal.shape) != 1:
-            raise PolicyError(f"metadata: '{signal.name}' must have one axis")
-    if LAST_COMMAND in names and command.quantity is not Quantity.JOINT_POSITION:
-        raise PolicyError(f"metadata: '{LAST_COMMAND}' is an input of position commands only")
-    memory = [(NEW_MEMORY, s.quantity, s.shape) for s in inputs if s.name == MEMORY]
-    if [(signal.name, signal.quantity, signal.shape) for signal in outputs[1:]] != memory:
-        raise PolicyError(
-            f"metadata: outputs must be {[command.name, *(name for name, *_ in memory)]}, "
-            f"'{NEW_MEMORY}' like '{MEMORY}'"
-        )
-
-
-def _position_limit(value: list[Any], joints: int) -> np.ndarray:
-    found = fields.array(value, "limits.position", (joints, 2), null=True)
-    found = np.where(np.isnan(found), np.array([-math.inf, math.inf]), found)
-    if not (found[:, 0] < found[:, 1]).all():
-        raise PolicyError("metadata: limits.position must be pairs of lower and upper limit")
-    return found
-
-
-def _golden(raw: dict[str, Any], sizes: dict[str, int]) -> dict[str, np.ndarray]:
-    pairs = len(get(raw, f"golden.{ERROR}", list))
-    if not 0 < pairs <= MAX_PAIRS:
-        raise PolicyError(f"metadata: there are {pairs:,} golden pairs, not 1 to {MAX_PAIRS:,}")
-    golden = get(raw, "golden", dict)
-    missing = [name for name in sizes if name not in golden]
-    if missing:
-        raise PolicyError(f"metadata: golden.{missing[0]} is missing")
-    return {
-        name: fields.array(golden[name], f"golden.{name}", (pairs, size), dtype=np.float32)
-        for name, size in sizes.items()
-    }
+def _positive(raw: dict[str, Any], key: str, shape: tuple[int, ...], most: float = math.inf) -> np.ndarray:
+    array = _array(raw, key, shape)
+    if not ((array > 0) & (array <= most)).all():
+        raise PolicyError(f"metadata: {key} must be positive" + (f", and at most {most:g}" if most < math.inf else ""))
+    return array

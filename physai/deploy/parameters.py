@@ -87,7 +87,9 @@ class ControllerConfig(Parameters):
     limit_margin: float = parameter(0.1, "no motion further into a position limit within this", "rad", 1e-3, 1.0)
     limit_velocity: float = parameter(0.05, "fastest joint while one is beyond its limit", "rad/s", 1e-3, 100.0)
     limit_fault: float = parameter(0.2, "farther than this beyond a position limit is a fault", "rad", 0.0, 10.0)
-    max_lead: float = parameter(0.25, "a position command may be this far from where the joint is", "rad", 1e-3, 3.0)
+    max_lead: float = parameter(
+        0.25, "a position command is at most this far from where its joint is", "rad", 1e-3, 3.0
+    )
     state_timeout: float = parameter(0.1, "a joint state older than this stops the arm", "s", 1e-3, 10.0)
     resume_timeout: float = parameter(
         1.0, "a robot silent for longer is not driven on to its old goal", "s", 1e-3, 3600.0
@@ -111,7 +113,7 @@ class ControllerConfig(Parameters):
         0.25, "reported velocities that differ by more from the moved positions are sensor errors", "rad/s", 0.01, 100.0
     )
     progress_timeout: float = parameter(
-        10.0, "an error that has not fallen for this long ends the motion", "s", 0.1, 3600.0
+        10.0, "a distance that has not fallen for this long ends the motion", "s", 0.1, 3600.0
     )
     effort_time: float = parameter(0.5, "an effort beyond its limit for this long is a fault", "s", 0.0, 60.0)
     clock_jump: float = parameter(1.0, "an update later than this is a jump of the clock", "s", 0.01, 3600.0)

@@ -6,13 +6,13 @@ import os
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 
 from physai.deploy import archive
-from physai.deploy.metadata import ERROR, GOAL, JOINT_POSITION, Metadata, PolicyError
+from physai.deploy.metadata import ERROR, GOAL, Metadata, PolicyError
 
 if TYPE_CHECKING:
     from tensordict.nn import TensorDictModule
@@ -20,19 +20,19 @@ if TYPE_CHECKING:
 Vector = Sequence[float] | np.ndarray
 
 # Golden pairs are equal to the last bit where the processor is the one that recorded them; others round differently.
-GOLDEN_TOLERANCE = 1e-4  # in the SI unit of each
+GOLDEN_TOLERANCE = 1e-4  # in the unit of each signal
 
 
 class Policy:
-    """From what one robot senses to its next command; of :func:`load_policy`. Not for several threads at once.
+    """From what one robot senses to its command; of :func:`load_policy`. Not for several threads at once.
 
     A policy that remembers keeps nothing itself: it takes a memory, and gives the memory for the next call.
 
     Attributes:
-        metadata: What the file says about itself: also what goes in and comes out, in order.
+        metadata: What the file says about itself.
         sha256: Hash of the file.
-        golden_error: Largest difference to the recorded commands on this machine, in their unit; 0.0 if all bits agree.
-        module: The TorchScript module, for batches: float32 tensors [N, *shape] of each input to those of each output.
+        golden_error: Largest difference to the recorded answers on this machine; 0.0 if all bits agree.
+        module: The TorchScript module, for batches: float32 tensors [N, ...] of its inputs to those of its outputs.
     """
 
     def __init__(self, module: torch.jit.ScriptModule, metadata: Metadata, sha256: str) -> None:
@@ -40,53 +40,51 @@ class Policy:
         self.metadata = metadata
         self.sha256 = sha256
         self.golden_error = 0.0
-        # Each row shares its memory with the tensor beside it: filling it is cheaper than making tensors.
-        self._rows = [np.zeros(signal.size, np.float32) for signal in metadata.inputs]
-        pairs = zip(self._rows, metadata.inputs, strict=True)
-        self._tensors = [torch.from_numpy(row).reshape(1, *signal.shape) for row, signal in pairs]
+        # Each array shares its memory with the tensor beside it: filling it is cheaper than making tensors.
+        self._arrays = [np.zeros((1, *signal.shape), np.float32) for signal in metadata.inputs]
+        self._tensors = [torch.from_numpy(array) for array in self._arrays]
         names = [signal.name for signal in metadata.inputs]
-        self._position, self._goal = names.index(JOINT_POSITION), names.index(GOAL)
-        self._remembers = len(metadata.outputs) > 1
+        self._position, self._goal = names.index("joint_position"), names.index(GOAL)
+        self._remembers = metadata.memory_size > 0
 
-    def __call__(self, *inputs: Vector) -> np.ndarray | tuple[np.ndarray, np.ndarray]:
-        """Map the inputs, each flat, in the order of ``metadata.inputs``, to a command [n], float32.
+    def __call__(self, *inputs: Vector) -> Any:
+        """Map the inputs that ``metadata.inputs`` declares, in that order, to the command [n], float32.
 
         A policy that remembers also takes a memory [H], zeros where an episode begins, and gives the new one, [H].
 
         Raises:
             ValueError: If one of them has another length, or is missing.
         """
-        if len(inputs) != len(self._rows):
-            raise ValueError(f"{len(self._rows)} inputs are needed, not {len(inputs)}")
-        for row, values in zip(self._rows, inputs, strict=True):
-            _fill(row, values)
-        if not self._remembers:
-            return self.module(*self._tensors)[0].numpy()
-        command, new_memory = self.module(*self._tensors)
-        return command[0].numpy(), new_memory[0].numpy()
+        if len(inputs) != len(self._arrays):
+            raise ValueError(f"{len(self._arrays)} inputs are needed, not {len(inputs)}")
+        for array, values in zip(self._arrays, inputs, strict=True):
+            _fill(array, values)
+        answer = self.module(*self._tensors)
+        return tuple(one[0].numpy() for one in answer) if self._remembers else answer[0].numpy()
 
     def error(self, joint_position: Vector, goal: Vector) -> np.ndarray:
-        """Return how far the robot is from a goal [g] at joint positions [n] rad: [E], as ``metadata.tolerances``.
+        """How far the robot is from a goal at joint positions [n] rad, one error for each tolerance, [e].
 
         Raises:
             ValueError: If one of them has another length.
         """
-        _fill(self._rows[self._position], joint_position)
-        _fill(self._rows[self._goal], goal)
+        _fill(self._arrays[self._position], joint_position)
+        _fill(self._arrays[self._goal], goal)
         return self.module.error(self._tensors[self._position], self._tensors[self._goal])[0].numpy()
 
     def as_tensordict_module(self) -> "TensorDictModule":
         """Wrap the module for TorchRL code, with its keys; needs tensordict."""
         from tensordict.nn import TensorDictModule
 
-        keys = [[signal.name for signal in side] for side in (self.metadata.inputs, self.metadata.outputs)]
-        return TensorDictModule(self.module, in_keys=keys[0], out_keys=keys[1])
+        sides = (self.metadata.inputs, self.metadata.outputs)
+        in_keys, out_keys = ([signal.name for signal in side] for side in sides)
+        return TensorDictModule(self.module, in_keys=in_keys, out_keys=out_keys)
 
 
 def _fill(row: np.ndarray, values: Vector) -> None:
-    if len(values) != len(row):  # NumPy would let one value stand for all
-        raise ValueError(f"{len(row)} values are needed, not {len(values)}")
-    row[:] = values
+    if len(values) != row.shape[1]:  # NumPy would let one value stand for all
+        raise ValueError(f"{row.shape[1]} values are needed, not {len(values)}")
+    row[0] = values
 
 
 def read_metadata(path: str | Path) -> Metadata:
@@ -131,8 +129,8 @@ def load_policy(path: str | Path, sha256: str | None = None, expect_joints: Sequ
         how = "with its joints in another order" if set(joints) == set(metadata.joints) else "for other joints"
         raise PolicyError(f"{path}: a policy {how}: {list(metadata.joints)}, not {list(joints)}")
     try:
-        names = [signal.name for signal in metadata.inputs]
-        policy = Policy(load_module(checked.content, names), metadata, digest)
+        inputs = [signal.name for signal in metadata.inputs]
+        policy = Policy(load_module(checked.content, inputs), metadata, digest)
         policy.golden_error = _golden_error(policy)
     except PolicyError as error:
         raise PolicyError(f"{path}: {error}") from None
@@ -164,7 +162,7 @@ def load_module(content: bytes, inputs: Sequence[str]) -> torch.jit.ScriptModule
 
     Args:
         content: Of the file.
-        inputs: Names of what the policy takes, in order.
+        inputs: What the policy takes.
 
     Raises:
         PolicyError: If its methods are not those of a policy.
@@ -173,7 +171,7 @@ def load_module(content: bytes, inputs: Sequence[str]) -> torch.jit.ScriptModule
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)  # of TorchScript
         module = torch.jit.load(io.BytesIO(content), map_location="cpu").eval()
-        for method, arguments in (("forward", inputs), (ERROR, (JOINT_POSITION, GOAL))):
+        for method, arguments in (("forward", inputs), (ERROR, ("joint_position", GOAL))):
             found = [a.name for a in getattr(module, method).schema.arguments[1:]] if hasattr(module, method) else None
             if found != list(arguments):
                 raise PolicyError(f"its {method} takes {found}, not {list(arguments)}")
@@ -185,30 +183,26 @@ def load_module(content: bytes, inputs: Sequence[str]) -> torch.jit.ScriptModule
 
 def _golden_error(policy: Policy) -> float:
     """Run all pairs, thrice: the first calls also let TorchScript's profiling executor settle."""
-    metadata, golden, worst = policy.metadata, policy.metadata.golden, 0.0
+    golden, metadata, worst = policy.metadata.golden, policy.metadata, 0.0
     pairs = [dict(zip(golden, values, strict=True)) for values in zip(*golden.values(), strict=True)]
     for pair in pairs * 3:
         inputs = [pair[signal.name] for signal in metadata.inputs]
         answer = policy(*inputs)
-        outputs = answer if isinstance(answer, tuple) else (answer,)
-        for signal, found in zip(metadata.outputs, outputs, strict=True):
-            unit = f" {signal.unit}" if signal is metadata.command else f" in {signal.name}"
-            worst = max(worst, _difference(found, pair[signal.name], unit, inputs))
-        error = policy.error(pair[JOINT_POSITION], pair[GOAL])
-        _difference(error, pair[ERROR], f" in {ERROR}", [pair[JOINT_POSITION], pair[GOAL]])
+        answers = answer if metadata.memory_size else (answer,)
+        found = {signal.name: one for signal, one in zip(metadata.outputs, answers, strict=True)}
+        found[ERROR] = policy.error(pair["joint_position"], pair[GOAL])
+        for key, given in found.items():
+            expected = pair[key]
+            if given.shape != expected.shape or given.dtype != np.float32:
+                raise PolicyError(f"it gives {given.dtype} {list(given.shape)}, not float32 {list(expected.shape)}")
+            error = float(np.abs(given - expected).max())
+            if not error <= GOLDEN_TOLERANCE:  # also where it is NaN
+                raise PolicyError(
+                    f"the {key} of a golden pair differs by {error:.3g}: at {_shown(*inputs)} it gives "
+                    f"{_shown(given)}, and gave {_shown(expected)} when it was exported"
+                )
+            worst = max(worst, error)
     return worst
-
-
-def _difference(found: np.ndarray, expected: np.ndarray, what: str, inputs: Sequence[np.ndarray]) -> float:
-    if found.shape != expected.shape or found.dtype != np.float32:
-        raise PolicyError(f"it gives {found.dtype} {list(found.shape)}, not float32 {list(expected.shape)}")
-    difference = float(np.abs(found - expected).max())
-    if not difference <= GOLDEN_TOLERANCE:  # also where it is NaN
-        raise PolicyError(
-            f"a golden pair differs by {difference:.3g}{what}: at {_shown(*inputs)} it gives {_shown(found)}, "
-            f"and gave {_shown(expected)} when it was exported"
-        )
-    return difference
 
 
 def _shown(*arrays: np.ndarray) -> str:

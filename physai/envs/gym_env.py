@@ -1,10 +1,8 @@
 """The Gymnasium shells: one robot, or N as one vector env; neither needs TorchRL."""
 
-import threading
 import time
 from collections.abc import Sequence
-from multiprocessing import current_process
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import gymnasium
 import numpy as np
@@ -13,33 +11,36 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from physai.config import compose, cores, validate
+from physai.config import compose, validate
 from physai.envs.simulation import EnvConfig, Simulation
-from physai.physics.viewer import Viewer, has_screen
+from physai.envs.viewing import has_screen, make_viewer, show
+
+if TYPE_CHECKING:
+    from physai.physics.viewer import Viewer
 
 Array = NDArray[Any]
-_WORTH_A_PROCESS = 32  # robots; with fewer, a step takes little longer than handing it over
 
 
-def _simulate(env: str, overrides: Sequence[str], num_envs: int, processes: int = 1) -> Simulation:
-    config = validate(EnvConfig, compose("train", [f"env={env}", *overrides]).env)
-    if processes != 1:
-        share = {**config.physics, "_partial_": True}
-        physics = {"_target_": "physai.physics.parallel.ParallelPhysics", "physics": share, "processes": processes}
-        config = config.model_copy(update={"physics": physics})
-    return Simulation(config, num_envs, seed=0)
+def _simulate(env: str, overrides: Sequence[str], num_envs: int) -> Simulation:
+    return Simulation(validate(EnvConfig, compose("train", [f"env={env}", *overrides]).env), num_envs, seed=0)
 
 
 def _spaces(simulation: Simulation) -> tuple[spaces.Box, spaces.Box]:
-    low, high = simulation.task.observation_bounds(simulation.spec, simulation.kinematics)
-    observation = spaces.Box(low.numpy(), high.numpy(), dtype=np.float32)
-    return observation, spaces.Box(-1.0, 1.0, (len(simulation.spec.joints),), np.float32)
+    low, high = simulation.task.observation.bounds
+    observation = spaces.Box(low.astype(np.float32), high.astype(np.float32), dtype=np.float32)
+    return observation, spaces.Box(-1.0, 1.0, simulation.spec.joint_command.shape, np.float32)
+
+
+def _errors(simulation: Simulation) -> dict[str, Array]:
+    """How far the robots are from their goals, by name, [N] each."""
+    names = (tolerance.name for tolerance in simulation.task.tolerances)
+    return dict(zip(names, simulation.error.T, strict=True))
 
 
 class RobotGymEnv(gymnasium.Env[Array, Array]):
     """One robot at a task, without randomization; observation and action as in ``physai.tasks``.
 
-    ``info`` holds ``is_success`` and ``distance`` (m).
+    ``info`` holds ``is_success`` and the task's errors by name, such as ``distance`` (m).
 
     Args:
         env: A file of ``conf/env``.
@@ -67,13 +68,18 @@ class RobotGymEnv(gymnasium.Env[Array, Array]):
             self._seeded = True
         self.simulation.reset()
         self._show()
-        return self.simulation.observe()[0], {"is_success": False, "distance": self.simulation.distance.item()}
+        return self.simulation.observe()[0], self._info()
 
     def step(self, action: Array) -> tuple[Array, float, bool, bool, dict[str, Any]]:
         """Apply an action [n] in [-1, 1] for one control period."""
-        moment = self.simulation.step_one(np.asarray(action, np.float32))
+        ended = self.simulation.step(np.asarray(action, np.float32)[None])
         self._show()
-        return moment
+        reward, terminated, truncated = (column.item() for column in ended)
+        return self.simulation.observe()[0], reward, terminated, truncated, self._info()
+
+    def _info(self) -> dict[str, Any]:
+        errors = {name: error.item() for name, error in _errors(self.simulation).items()}
+        return {"is_success": self.simulation.success.item(), **errors}
 
     def _show(self) -> None:
         if self.render_mode == "human":
@@ -83,8 +89,8 @@ class RobotGymEnv(gymnasium.Env[Array, Array]):
 
     def _picture(self) -> Array | None:
         if self._viewer is None:
-            self._viewer = self.simulation.viewer(window=self.render_mode == "human")
-        return self._viewer.show(self.simulation.joint_position[0], self.simulation.goal[0])
+            self._viewer = make_viewer(self.simulation, window=self.render_mode == "human")
+        return show(self._viewer, self.simulation)
 
     def render(self) -> Array | None:
         """Return an image [height, width, 3] uint8 in the mode ``rgb_array``."""
@@ -98,12 +104,6 @@ class RobotGymEnv(gymnasium.Env[Array, Array]):
             self._viewer = None
 
 
-def _fastest_processes(num_envs: int) -> int:
-    """How many processes are worth their while; one, where others may not start, or would end with a thread."""
-    alone = current_process().daemon or threading.current_thread() is not threading.main_thread()
-    return 1 if alone else max(1, min(cores(), num_envs // _WORTH_A_PROCESS))
-
-
 class RobotVectorEnv(VectorEnv[Array, Array, Array]):
     """N robots as a Gymnasium vector env; an episode that is over restarts at the next step.
 
@@ -112,8 +112,6 @@ class RobotVectorEnv(VectorEnv[Array, Array, Array]):
         num_envs: N.
         render_mode: ``rgb_array`` shows the first robot.
         overrides: Hydra overrides.
-        processes: How many share the physics, with this one, and move the robots as one would; on Linux, they end with
-            the thread that makes the env. By default, one for each core that has 32 robots to move; in a thread, one.
     """
 
     metadata = {  # noqa: RUF012
@@ -128,11 +126,8 @@ class RobotVectorEnv(VectorEnv[Array, Array, Array]):
         num_envs: int = 1,
         render_mode: str | None = None,
         overrides: Sequence[str] = (),
-        processes: int | None = None,
     ) -> None:
-        if processes is None:
-            processes = _fastest_processes(num_envs)
-        self.simulation = _simulate(env, overrides, num_envs, processes)
+        self.simulation = _simulate(env, overrides, num_envs)
         self.metadata = {**self.metadata, "render_fps": round(1 / self.simulation.config.control_dt)}
         self.num_envs = num_envs
         self.render_mode = render_mode
@@ -158,7 +153,7 @@ class RobotVectorEnv(VectorEnv[Array, Array, Array]):
         ended = self.simulation.step(np.asarray(actions, np.float32), restart=self._over)
         reward, terminated, truncated = (column[:, 0] for column in ended)
         self._over = terminated | truncated
-        info = {"is_success": terminated, "distance": self.simulation.distance[:, 0]}
+        info = {"is_success": self.simulation.success[:, 0], **_errors(self.simulation)}
         return self.simulation.observe(), reward, terminated, truncated, info
 
     def render(self) -> tuple[Array, ...] | None:
@@ -166,8 +161,8 @@ class RobotVectorEnv(VectorEnv[Array, Array, Array]):
         if self.render_mode != "rgb_array":
             return None
         if self._viewer is None:
-            self._viewer = self.simulation.viewer()
-        image = self._viewer.show(self.simulation.joint_position[0], self.simulation.goal[0])
+            self._viewer = make_viewer(self.simulation)
+        image = show(self._viewer, self.simulation)
         return None if image is None else (image,)
 
     def close_extras(self, **kwargs: Any) -> None:

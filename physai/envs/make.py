@@ -14,9 +14,9 @@ from physai.envs.simulation import EnvConfig, Simulation
 from physai.physics import RandomizationConfig
 from physai.seeding import derive
 from physai.transforms import (
-    ActuatorDelay,
     DomainRandomization,
     Memory,
+    Normalizer,
     Observation,
     ObservationNormalization,
     SensorModel,
@@ -40,8 +40,13 @@ class TransformedRobotEnv(TransformedEnv):
         return self.base_env.simulation
 
     @property
+    def normalizer(self) -> Normalizer:
+        """What normalizes observations."""
+        return self.normalization.normalizer
+
+    @property
     def normalization(self) -> ObservationNormalization:
-        """The transform that holds the statistics."""
+        """The transform that holds it."""
         return next(t for t in self.transform if isinstance(t, ObservationNormalization))
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -84,13 +89,13 @@ class TransformedRobotEnv(TransformedEnv):
     def state(self) -> dict[str, dict[str, Tensor]]:
         """Return the state of robots, episodes, transforms and random numbers."""
         return {
-            "simulation": self.simulation.state(),
+            "simulation": self.simulation.snapshot(),
             "transforms": {k: v.clone() for k, v in self.transform.state_dict().items()},
         }
 
     def set_state(self, state: dict[str, dict[str, Tensor]]) -> None:
         """Restore what ``state`` returned, in an env made from the same config."""
-        self.simulation.set_state(state["simulation"])
+        self.simulation.restore(state["simulation"])
         self.transform.load_state_dict(state["transforms"])
 
 
@@ -114,18 +119,15 @@ def make_env(
     """
     base = RobotEnv(env, num_envs)
     layout = base.simulation.layout
-    joints = len(base.simulation.spec.joints)
     transforms: list[Transform] = []
     if randomization.draws:
         transforms.append(DomainRandomization(randomization, layout, num_envs, 0))
-    if randomization.max_delay:
-        transforms.append(ActuatorDelay(layout, num_envs, joints, randomization.max_delay))
     if randomization.affects("encoder_offset", "position_noise", "velocity_noise"):
         transforms.append(SensorModel(layout, 0))
-    transforms.append(Observation(base.simulation.observation))
+    transforms.append(Observation(base.simulation.task.module))
     made = TransformedRobotEnv(base, Compose(*transforms))
     size = made.observation_spec["observation"].shape[-1]
-    made.append_transform(ObservationNormalization(size, normalization.eps, normalization.clip))
+    made.append_transform(ObservationNormalization(Normalizer(size, normalization.clip)))
     if memory_size:
         made.append_transform(Memory(memory_size, num_envs))
     made.set_seed(seed)
@@ -141,7 +143,7 @@ def make(
         name: A file of ``conf/env``.
         num_envs: N.
         seed: Seeds every source of randomness in the env.
-        overrides: Hydra overrides such as ``randomization=strong`` or ``env.max_velocity=1.0``.
+        overrides: Hydra overrides such as ``randomization=strong`` or ``env.task.max_steps=100``.
 
     Raises:
         UserError: If an override is wrong; the message names the nearest right one.

@@ -1,5 +1,6 @@
 """The TorchRL shell: N robots as one natively batched environment."""
 
+import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Binary, Bounded, Composite, Unbounded
@@ -7,15 +8,16 @@ from torchrl.envs import EnvBase
 
 from physai.envs.simulation import EnvConfig, Simulation
 
-_OBSERVED = ("joint_position", "joint_velocity", "goal", "physics_parameters", "episode_length", "episode_return")
+_OBSERVED = ("physics_parameters", "success", "episode_length", "episode_rewards")
 
 
 class RobotEnv(EnvBase):
     """N robots at a task, ``batch_size=[N]``.
 
-    It speaks of what a robot senses (``joint_position``, ``joint_velocity``, ``goal``) and leaves what a policy sees
-    to the transforms. Beside them: ``physics_parameters`` (see :class:`physai.physics.ParameterLayout`; read at
-    reset, when given), ``episode_length`` and ``episode_return``. Only the rows of ``_reset`` are reset.
+    It speaks of what a robot senses and a task asks (:attr:`Simulation.sensed`) and leaves what a policy sees to the
+    transforms. Beside them: ``physics_parameters`` (see :class:`physai.physics.ParameterLayout`; read at reset, when
+    given), ``success``, ``episode_length`` and ``episode_rewards`` (one column a term of the reward). Only the rows of
+    ``_reset`` are reset.
 
     Args:
         config: The environment.
@@ -27,18 +29,16 @@ class RobotEnv(EnvBase):
         super().__init__(device=None, batch_size=[num_envs])  # a device would be checked and cast to at every step
         self.simulation = Simulation(config, num_envs, seed)
         joints = len(self.simulation.spec.joints)
-        goal, parameters = self.simulation.task.goal_size, len(self.simulation.layout.nominal)
 
         def unbounded(size: int, dtype: torch.dtype = torch.float32) -> Unbounded:
             return Unbounded(shape=(num_envs, size), dtype=dtype)
 
         self.observation_spec = Composite(
-            joint_position=unbounded(joints),
-            joint_velocity=unbounded(joints),
-            goal=unbounded(goal),
-            physics_parameters=unbounded(parameters),
+            **{signal.name: Unbounded(shape=(num_envs, *signal.shape)) for signal in self.simulation.sensed},
+            physics_parameters=unbounded(len(self.simulation.layout.nominal)),
+            success=Binary(1, shape=(num_envs, 1), dtype=torch.bool),
             episode_length=unbounded(1, torch.int64),
-            episode_return=unbounded(1),
+            episode_rewards=unbounded(len(self.simulation.reward_terms)),
             shape=[num_envs],
         )
         self.action_spec = Bounded(-1.0, 1.0, shape=(num_envs, joints), dtype=torch.float32)
@@ -49,7 +49,17 @@ class RobotEnv(EnvBase):
         )
 
     def _observe(self) -> dict[str, torch.Tensor]:
-        return {key: torch.from_numpy(getattr(self.simulation, key)) for key in _OBSERVED}
+        simulation = self.simulation
+        seen = {
+            "joint_position": simulation.state.joint_position,
+            "joint_velocity": simulation.state.joint_velocity,
+            "goal": simulation.goal,
+            "last_command": simulation.last_command,
+        }
+        return {
+            **{signal.name: torch.from_numpy(seen[signal.name].astype(np.float32)) for signal in simulation.sensed},
+            **{key: torch.from_numpy(getattr(simulation, key)) for key in _OBSERVED},
+        }
 
     def _reset(self, tensordict: TensorDictBase | None = None, **_: object) -> TensorDict:
         rows = parameters = None

@@ -1,25 +1,23 @@
 """N robots at a task: the core that the TorchRL and the Gymnasium shells share."""
 
-import math
 from typing import Annotated, Any
 
 import numpy as np
 import torch
-from pydantic import AfterValidator
+from pydantic import AfterValidator, Field
 from torch import Tensor
 
-from physai.config import Config, Count, PositiveFloat
+from physai.config import Config, Count, NonNegativeFloat, PositiveFloat
 from physai.errors import UserError
-from physai.physics import ParameterLayout, Physics
-from physai.physics.viewer import Viewer
-from physai.robots import ForwardKinematics, RobotConfig, RobotSpec, TipPosition
+from physai.physics import ActuatorDelay, ParameterLayout, Physics, RobotState
+from physai.robots import ForwardKinematics, JointCommand, RobotConfig, RobotSpec
+from physai.signals import Quantity, Signal
 from physai.targets import Target, find, make
+from physai.tasks import Step, Task
 
-_STATE = ("goal", "episode_length", "episode_return", "physics_parameters")  # beside what the physics holds
-
-
-_TASK = ("check", "goal_size", "max_steps", "observation", "sample_goal", "sample_start", "success", "reward")
-_PHYSICS = ("reset", "step", "joint_state", "close")
+_TASK = ("goal", "region", "tolerances", "module", "max_steps", "success", "terminated", "rewards")
+_PHYSICS = ("reset", "step", "robot_state", "close")
+_STATE = ("goal", "last_command", "episode_length", "episode_rewards", "physics_parameters", "within")
 
 
 def _says_whether_simulated(node: dict[str, Any]) -> dict[str, Any]:
@@ -28,11 +26,23 @@ def _says_whether_simulated(node: dict[str, Any]) -> dict[str, Any]:
     return node
 
 
+class StartConfig(Config):
+    """Where episodes begin.
+
+    ``spread``: uniformly within the home pose plus or minus this, rad, one value a joint. ``carried_over``: a share of
+    the episodes that begins where the last one ended, as on a robot that gets one goal after the other.
+    """
+
+    spread: list[NonNegativeFloat]
+    carried_over: Annotated[float, Field(ge=0, le=1)]
+
+
 class EnvConfig(Config):
     """One file of ``conf/env``: a robot, a task, and how they run.
 
     ``physics`` names a :class:`physai.physics.Physics`, and what its constructor takes beside robot, number, control
-    period and substeps.
+    period and substeps; ``task`` a :class:`physai.tasks.Task`, and what its constructor takes beside robot and
+    kinematics.
     """
 
     name: str
@@ -41,31 +51,12 @@ class EnvConfig(Config):
     physics: Annotated[Target, AfterValidator(_says_whether_simulated)]
     control_dt: PositiveFloat
     substeps: Count
-    max_velocity: PositiveFloat
+    start: StartConfig
 
     @property
     def simulated(self) -> bool:
         """Whether there can be many of its robots, which are put anywhere and given other dynamics."""
         return bool(find(self.physics["_target_"]).simulated)
-
-
-class _Rows:
-    """An array of one row a robot, which is made when it is asked for if it was given as lists.
-
-    Lists come from ``step_one``, which has no time for six small arrays that nobody may look at.
-    """
-
-    def __init__(self, dtype: type) -> None:
-        self._dtype = dtype
-
-    def __set_name__(self, owner: type, name: str) -> None:
-        self._name = f"_{name}"
-
-    def __get__(self, simulation: "Simulation", owner: type) -> np.ndarray:
-        return np.asarray(getattr(simulation, self._name), self._dtype)
-
-    def __set__(self, simulation: "Simulation", value: Any) -> None:
-        setattr(simulation, self._name, value)
 
 
 class Simulation:
@@ -80,46 +71,56 @@ class Simulation:
         seed: Seeds goals and start poses.
 
     Attributes:
-        observation: The task's module that makes what a policy sees, and knows the distance to the goal.
-        joint_position, joint_velocity: True joint state, rad and rad/s, [N, n].
-        end_effector: True position of the end effector in the plane, m, [N, 2].
-        goal: [N, 2], m.
-        distance: To the goal, m, [N, 1].
+        state: What the robots truly do.
+        goal: [N, g].
+        error: How far they are from it, one column a tolerance, [N, e].
+        success: Whether the last step was one, [N, 1].
+        last_command: What the robots were told last, [N, n], rad/s or rad; where they stand when an episode begins.
         episode_length: Control steps since the last reset, [N, 1].
-        episode_return: Sum of rewards since the last reset, [N, 1].
+        episode_rewards: Sum of each term of the reward since the last reset, [N, terms].
         physics_parameters: Those in force, [N, P] (see :class:`physai.physics.ParameterLayout`).
+        within: Control steps that the goal has been held, [N].
+        reward_terms: Names of the terms.
     """
-
-    joint_position, joint_velocity, end_effector, distance, episode_return = (_Rows(np.float32) for _ in range(5))
-    episode_length = _Rows(np.int64)
 
     def __init__(self, config: EnvConfig, num_envs: int, seed: int) -> None:
         self.config = config
         self.num_envs = num_envs
         self.spec = RobotSpec.from_config(config.robot)
-        self.kinematics = ForwardKinematics(self.spec)
-        self._tip = TipPosition(self.kinematics)
-        self._continuous = self.spec.continuous.nonzero()[0].tolist()
-        self.layout = ParameterLayout(self.spec)
-        self.task = make("env.task", config.task, needs=_TASK)
-        self.task.check(self.spec, self.kinematics)
-        if config.max_velocity > self.spec.velocity_limit.min():
+        if len(config.start.spread) != len(self.spec.joints):
             raise UserError(
-                f"env.max_velocity: {config.max_velocity} rad/s is beyond the limit of '{self.spec.name}', "
-                f"{self.spec.velocity_limit.min():g} rad/s"
+                f"env.start.spread has {len(config.start.spread)} values for {len(self.spec.joints)} joints"
             )
-        self.observation = self.task.observation(self.spec, self.kinematics)
+        self.kinematics = ForwardKinematics(self.spec)
+        self.layout = ParameterLayout(self.spec)
+        self.joint_command = JointCommand(self.spec, config.control_dt)
+        self.task: Task = make("env.task", config.task, self.spec, self.kinematics, needs=_TASK)
         sizes = num_envs, config.control_dt, config.substeps
         self.physics: Physics = make("env.physics", config.physics, self.spec, *sizes, needs=_PHYSICS)
         self.generator = torch.Generator()
         self.seed(seed)
-        joints = len(self.spec.joints)
-        self.joint_position, self.joint_velocity, self.goal, self.end_effector, self.distance = (
-            np.zeros((num_envs, size), np.float32) for size in (joints, joints, self.task.goal_size, 2, 1)
-        )
-        self._episode_length: Any = np.zeros((num_envs, 1), np.int64)
-        self._episode_return: Any = np.zeros((num_envs, 1), np.float32)
-        self.physics_parameters = self.layout.nominal.repeat(num_envs, 1).numpy()
+        self._tolerance = np.array([tolerance.value for tolerance in self.task.tolerances])
+        self._delay = ActuatorDelay(num_envs, len(self.spec.joints))
+        self.state: RobotState = self.physics.robot_state()
+        self.goal: np.ndarray = np.zeros((num_envs, *self.task.goal.shape))
+        self.physics_parameters: np.ndarray = self.layout.nominal.repeat(num_envs, 1).numpy()
+        self.last_command = self._standing(self.state)
+        self.within = np.zeros(num_envs, np.int64)
+        self.error = self.task.error(self.state, self.goal)
+        self.success = np.zeros((num_envs, 1), bool)
+        self.reward_terms = tuple(self.task.rewards(self._step(self.last_command), self.success[:, 0]))
+        self.episode_length = np.zeros((num_envs, 1), np.int64)
+        self.episode_rewards = np.zeros((num_envs, len(self.reward_terms)), np.float32)
+
+    @property
+    def sensed(self) -> tuple[Signal, ...]:
+        """What a policy gets from robot and task, in this order."""
+        signals = (self.spec.joint_position, self.spec.joint_velocity, self.task.goal)
+        if self.spec.command is not Quantity.JOINT_POSITION:
+            return signals
+        command = self.spec.joint_command
+        last = Signal("last_command", command.quantity, command.shape, command.low, command.high, command.labels)
+        return (*signals, last)
 
     def seed(self, seed: int) -> None:
         """Restart the random numbers of goals and start poses."""
@@ -128,19 +129,45 @@ class Simulation:
     def reset(self, rows: np.ndarray | None = None, parameters: np.ndarray | None = None) -> None:
         """Start new episodes in the rows of a mask [N] (all by default), with new parameters [N, P] if given."""
         self._begin(np.arange(self.num_envs) if rows is None else rows.nonzero()[0], parameters)
-        self._read(*self.physics.joint_state())
+        self.error = self.task.error(self.state, self.goal)
 
-    def _begin(self, index: np.ndarray, parameters: np.ndarray | None = None) -> None:
-        start = self.task.sample_start(len(index), self.spec, self.generator)
-        self.goal = _replaced(self.goal, index, self.task.sample_goal(len(index), self.generator))
-        self.episode_length = _replaced(self.episode_length, index, 0)
-        self.episode_return = _replaced(self.episode_return, index, 0.0)
-        dynamics = None
+    def _begin(self, rows: np.ndarray, parameters: np.ndarray | None = None) -> None:
+        start = self._start(rows)
+        self.goal = _replaced(self.goal, rows, self.task.region.sample(len(rows), self.generator))
+        self.episode_length = _replaced(self.episode_length, rows, 0)
+        self.episode_rewards = _replaced(self.episode_rewards, rows, 0.0)
+        self.within = _replaced(self.within, rows, 0)
+        self.success = _replaced(self.success, rows, False)
+        dynamics = delay = None
         if parameters is not None:
-            new = parameters[index]
-            self.physics_parameters = _replaced(self.physics_parameters, index, new)
+            new = parameters[rows]
+            self.physics_parameters = _replaced(self.physics_parameters, rows, new)
             dynamics = self.layout.dynamics(new)
-        self.physics.reset(index, start, np.zeros_like(start), dynamics)
+            delay = new[:, self.layout.columns["actuator_delay"]][:, 0]
+        self.physics.reset(rows, start, dynamics)
+        self.state = self.physics.robot_state()
+        standing = self._standing(self.state)[rows]
+        self.last_command = _replaced(self.last_command, rows, standing)
+        self._delay.reset(rows, standing, delay)
+
+    def _start(self, rows: np.ndarray) -> RobotState:
+        """Draw where the episodes of some rows begin, and within the limits."""
+        config, spec, count = self.config.start, self.spec, len(rows)
+        position = np.tile(spec.home, (count, 1))
+        velocity = np.zeros_like(position)
+        if any(config.spread):  # else a seed gives the same goals to robots one after the other as side by side
+            draw = torch.rand(position.shape, generator=self.generator, dtype=torch.float64).numpy()
+            position = np.clip(position + (2 * draw - 1) * np.array(config.spread), *spec.position_limit.T)
+        if config.carried_over:
+            carried = torch.rand(count, 1, generator=self.generator).numpy() < config.carried_over
+            position = np.where(carried, self.state.joint_position[rows], position)
+            velocity = np.where(carried, self.state.joint_velocity[rows], velocity)
+        return RobotState(position, velocity)
+
+    def _standing(self, state: RobotState) -> np.ndarray:
+        """The command that keeps robots where they are."""
+        takes_positions = self.spec.command is Quantity.JOINT_POSITION
+        return state.joint_position if takes_positions else np.zeros_like(state.joint_position)
 
     def step(self, action: np.ndarray, restart: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Apply actions [N, n] in [-1, 1] for one control period.
@@ -150,94 +177,67 @@ class Simulation:
             restart: Rows [N] that start a new episode instead; there nothing is earned, and nothing ends.
 
         Returns:
-            reward, terminated, truncated, each [N, 1]. Reaching the goal terminates; running out of time truncates,
-            and a step that does both only terminates.
+            reward, terminated, truncated, each [N, 1]. Running out of time truncates, and a step that also terminates
+            only terminates.
         """
-        command = np.maximum(np.minimum(action, 1.0), -1.0) * np.float64(self.config.max_velocity)
-        joint_state = self.physics.step(command)
+        command = self.joint_command.of_arrays(action, self.state.joint_position, self.last_command)
+        self.last_command = command
+        self.state = self.physics.step(self._delay(command))
         length = self.episode_length + 1
         if restart is not None and restart.any():
-            index = restart.nonzero()[0]
-            self._begin(index)
-            joint_state, length[index] = self.physics.joint_state(), 0
+            self._begin(rows := restart.nonzero()[0])
+            length[rows] = 0
         else:
-            index = None
-        self._read(*joint_state)
-        terminated = self.task.success(self.distance)
-        reward = self.task.reward(self.distance, terminated).astype(np.float32)
-        if index is not None:
-            terminated[index], reward[index] = False, 0.0
+            rows = None
+        self.error = self.task.error(self.state, self.goal)
+        near = (self.error < self._tolerance).all(axis=1)
+        self.within = np.where(near, self.within + 1, 0)
+        step = self._step(command)
+        success = self.task.success(step)
+        terminated = self.task.terminated(step, success)
+        rewards = np.stack(list(self.task.rewards(step, success).values()), axis=1).astype(np.float32)
+        if rows is not None:
+            self.within[rows], success[rows], terminated[rows], rewards[rows] = 0, False, False, 0.0
+        self.success, terminated = success[:, None], terminated[:, None]
         self.episode_length = length
-        self.episode_return = self.episode_return + reward
-        truncated = (self.episode_length >= self.task.max_steps) & ~terminated
-        return reward, terminated, truncated
+        self.episode_rewards = self.episode_rewards + rewards
+        truncated = (length >= self.task.max_steps) & ~terminated
+        return rewards.sum(axis=1, keepdims=True), terminated, truncated
 
-    def step_one(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """Step the only robot: ``step`` and ``observe`` in plain numbers, of double precision.
-
-        Of one robot, NumPy's calls cost more than what they compute, too.
-
-        Args:
-            action: [n] in [-1, 1].
-
-        Returns:
-            Observation [2n + 4], reward, terminated, truncated, and ``is_success`` and ``distance`` (m).
-        """
-        fastest = self.config.max_velocity
-        command = [min(max(share, -1.0), 1.0) * fastest for share in action.tolist()]
-        position, velocity = self.physics.step_one(command)
-        (goal,) = self.goal.tolist()
-        tip = self._tip.of_one(position)
-        distance = math.dist(tip, goal)
-        terminated = self.task.success(distance)
-        reward = self.task.reward(distance, terminated)
-        length = int(self._episode_length[0][0]) + 1
-        episode_return = float(self._episode_return[0][0]) + reward
-        self._joint_position, self._joint_velocity, self._end_effector = [position], [velocity], [tip]
-        self._distance, self._episode_length, self._episode_return = [[distance]], [[length]], [[episode_return]]
-        observation = np.array(self.task.observe(self._continuous, position, velocity, tip, goal), np.float32)
-        truncated = length >= self.task.max_steps and not terminated
-        return observation, reward, terminated, truncated, {"is_success": terminated, "distance": distance}
+    def _step(self, command: np.ndarray) -> Step:
+        return Step(self.state, command, self.goal, self.error, self.within * self.config.control_dt)
 
     def observe(self) -> np.ndarray:
-        """Return what a policy sees of the true state, [N, 2n + 4]: the same as the module ``observation`` makes."""
-        columns = self.joint_position.T.astype(float), self.joint_velocity.T, self.end_effector.T, self.goal.T
-        return np.ascontiguousarray(np.array(self.task.observe(self._continuous, *columns)).T, np.float32)
+        """Return what a policy sees of the true state, [N, o], float32."""
+        return self.task.observe(self.state, self.goal)
 
-    def _read(self, joint_position: np.ndarray, joint_velocity: np.ndarray) -> None:
-        self.joint_position = joint_position.astype(np.float32)
-        self.joint_velocity = joint_velocity.astype(np.float32)
-        self.end_effector = np.ascontiguousarray(self._tip.of_many(joint_position).T, np.float32)
-        error = self.end_effector - self.goal
-        self.distance = np.hypot(error[:, :1], error[:, 1:])
-
-    def state(self) -> dict[str, Tensor]:
-        """Return everything that ``set_state`` of an equal simulation needs to go on bit for bit."""
+    def snapshot(self) -> dict[str, Tensor]:
+        """Return everything that ``restore`` of an equal simulation needs to go on bit for bit."""
         arrays = {f"physics.{key}": value for key, value in self.physics.state().items()}
+        arrays |= {f"delay.{key}": value for key, value in self._delay.state().items()}
         arrays |= {key: getattr(self, key) for key in _STATE}
         return {
             **{key: torch.from_numpy(value) for key, value in arrays.items()},
             "generator": self.generator.get_state(),
         }
 
-    def set_state(self, state: dict[str, Tensor]) -> None:
-        """Restore what ``state`` returned."""
-        prefix = "physics."
-        self.physics.set_state({k.removeprefix(prefix): v.numpy() for k, v in state.items() if k.startswith(prefix)})
+    def restore(self, snapshot: dict[str, Tensor]) -> None:
+        """Go on from a ``snapshot``."""
+        self.physics.set_state(_within(snapshot, "physics."))
+        self._delay.set_state(_within(snapshot, "delay."))
         for key in _STATE:
-            setattr(self, key, state[key].numpy())
-        self.generator.set_state(state["generator"])
-        self._read(*self.physics.joint_state())
-
-    def viewer(self, window: bool = False) -> Viewer:
-        """Make a viewer for these robots; it has a world of its own."""
-        home = torch.from_numpy(self.spec.home).float()
-        height = float(self.kinematics(home[None])[0, 2])
-        return Viewer(self.spec, height, self.kinematics.reach, self.task.tolerance, window)
+            setattr(self, key, snapshot[key].numpy())
+        self.generator.set_state(snapshot["generator"])
+        self.state = self.physics.robot_state()
+        self.error = self.task.error(self.state, self.goal)
 
     def close(self) -> None:
         """Free the physics engine."""
         self.physics.close()
+
+
+def _within(snapshot: dict[str, Tensor], prefix: str) -> dict[str, np.ndarray]:
+    return {key.removeprefix(prefix): value.numpy() for key, value in snapshot.items() if key.startswith(prefix)}
 
 
 def _replaced(array: np.ndarray, rows: np.ndarray, values: np.ndarray | float) -> np.ndarray:

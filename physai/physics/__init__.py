@@ -1,7 +1,18 @@
 """A batch of simulated robots behind one small interface."""
 
-from physai.physics.interface import DynamicsParameters, Physics, nominal_dynamics
+from physai.physics.actuation import ActuatorDelay
+from physai.physics.interface import DynamicsParameters, Physics, RobotState, nominal_dynamics
 from physai.physics.parameters import ParameterLayout
 from physai.physics.randomization import RandomizationConfig
+from physai.physics.sensing import SensorErrors
 
-__all__ = ["DynamicsParameters", "ParameterLayout", "Physics", "RandomizationConfig", "nominal_dynamics"]
+__all__ = [
+    "ActuatorDelay",
+    "DynamicsParameters",
+    "ParameterLayout",
+    "Physics",
+    "RandomizationConfig",
+    "RobotState",
+    "SensorErrors",
+    "nominal_dynamics",
+]

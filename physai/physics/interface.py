@@ -1,5 +1,6 @@
 """What the rest of physai expects of a physics engine."""
 
+from dataclasses import dataclass
 from typing import ClassVar, Protocol
 
 import numpy as np
@@ -8,8 +9,8 @@ from physai.robots import RobotSpec
 
 DynamicsParameters = dict[str, np.ndarray]
 """Per robot and absolute, each [rows, k]: ``link_mass`` (kg, one a moving link), ``payload`` (kg at the tip, 1), and
-one a joint of ``joint_damping`` (N·m·s/rad), ``joint_friction`` (N·m), ``effort_limit`` (N·m), ``velocity_gain``
-(1)."""
+one a joint of ``joint_damping`` (N·m·s/rad), ``joint_friction`` (N·m), ``effort_limit`` (N·m), ``velocity_gain`` (the
+share of the missing velocity that a motor makes up for in a control period)."""
 
 
 def nominal_dynamics(spec: RobotSpec) -> DynamicsParameters:
@@ -25,8 +26,33 @@ def nominal_dynamics(spec: RobotSpec) -> DynamicsParameters:
     }
 
 
+@dataclass(frozen=True)
+class RobotState:
+    """What N robots do; float64, robots are rows. None stands for what an engine or a robot does not tell.
+
+    Attributes:
+        joint_position: rad, [N, n].
+        joint_velocity: rad/s, [N, n].
+        joint_effort: N·m, [N, n].
+        base_pose: Of a floating base in the world: x, y, z in m, then a quaternion x, y, z, w, [N, 7].
+        base_twist: Its velocity, m/s, then its angular velocity, rad/s, in the world, [N, 6].
+        contact: Whether each of the robot's feet touches anything, [N, feet].
+    """
+
+    joint_position: np.ndarray
+    joint_velocity: np.ndarray
+    joint_effort: np.ndarray | None = None
+    base_pose: np.ndarray | None = None
+    base_twist: np.ndarray | None = None
+    contact: np.ndarray | None = None
+
+
 class Physics(Protocol):
-    """N robots with n velocity-controlled joints each; arrays are float64, robots are rows.
+    """N robots with n joints each, driven by what their description says: joint velocities or joint positions.
+
+    Made from a robot, their number, the control period and the substeps of a period. An engine that cannot do what a
+    description asks for, such as a floating base, refuses it by name with a UserError. Dynamics parameters mean the
+    same in each engine and at any number of substeps.
 
     Attributes:
         simulated: Whether N is free, and robots can be put into any state and given other dynamics. What is not
@@ -36,26 +62,17 @@ class Physics(Protocol):
     simulated: ClassVar[bool]
     num_robots: int
 
-    def reset(
-        self,
-        rows: np.ndarray,
-        joint_position: np.ndarray,
-        joint_velocity: np.ndarray,
-        parameters: DynamicsParameters | None = None,
-    ) -> None:
-        """Put the robots ``rows`` [r] into a state [r, n], rad and rad/s, and give them new dynamics if any are given.
+    def reset(self, rows: np.ndarray, state: RobotState, parameters: DynamicsParameters | None = None) -> None:
+        """Put the robots ``rows`` [r] into a state of r rows, and give them new dynamics if any are given.
 
         A reset robot behaves exactly like a fresh one; the others are not touched.
         """
 
-    def step(self, velocity_command: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Hold a velocity command [N, n], rad/s, for one control period; return joint positions and velocities."""
+    def step(self, command: np.ndarray) -> RobotState:
+        """Hold a command [N, n], rad/s or rad, for one control period; return where it led to."""
 
-    def step_one(self, velocity_command: list[float]) -> tuple[list[float], list[float]]:
-        """``step`` of the only robot in plain numbers, n each."""
-
-    def joint_state(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return joint positions [N, n], rad, and velocities [N, n], rad/s."""
+    def robot_state(self) -> RobotState:
+        """Return what the robots do now."""
 
     def parameters(self) -> DynamicsParameters:
         """Return the dynamics in force, read back from the engine where it can tell."""

@@ -10,8 +10,9 @@ import numpy as np
 import pybullet as bullet
 
 from physai.errors import UserError
-from physai.physics.interface import DynamicsParameters, nominal_dynamics
+from physai.physics.interface import DynamicsParameters, RobotState, nominal_dynamics
 from physai.robots import RobotSpec, urdf
+from physai.signals import Quantity
 
 _FIXED_BASE = {"useFixedBase": True, "flags": bullet.URDF_USE_INERTIA_FROM_FILE}
 APART = 10.0  # m; each pair of robots that could touch costs time in each step, and few arms are longer than 5 m
@@ -33,12 +34,13 @@ class _World:
 
 
 class PyBulletPhysics:
-    """N velocity-controlled robots with a fixed base, in free space under gravity.
+    """N robots with a fixed base, in free space under gravity.
 
     The interface is :class:`physai.physics.Physics`. Joints that the spec does not control are welded at zero, and
     shapes are left out: nothing touches anything here, so the state of a robot is its joint positions and velocities.
 
-    Each joint is driven by PyBullet's velocity motor with a limited effort. Coulomb friction has no counterpart in
+    Each joint is driven by PyBullet's velocity motor with a limited effort; where the robot takes positions, a servo
+    tells the motor how fast to go, once a control period. Coulomb friction has no counterpart in
     PyBullet's motors; it takes its share of the effort when the motor speeds a joint up, and helps when it brakes.
 
     Args:
@@ -81,23 +83,14 @@ class PyBulletPhysics:
         # Body, joint, effort to speed up and to brake with, gain.
         self._motors = [(body, joint, 0.0, 0.0, 0.0) for _, body in self._row for joint in joints]
         self._parameters = {key: np.repeat(value, num_robots, axis=0) for key, value in nominal_dynamics(spec).items()}
-        self.reset(
-            np.arange(num_robots),
-            np.tile(spec.home, (num_robots, 1)),
-            np.zeros((num_robots, n)),
-            self._parameters,
-        )
+        home = RobotState(np.tile(spec.home, (num_robots, 1)), np.zeros((num_robots, n)))
+        self.reset(np.arange(num_robots), home, self._parameters)
 
-    def reset(
-        self,
-        rows: np.ndarray,
-        joint_position: np.ndarray,
-        joint_velocity: np.ndarray,
-        parameters: DynamicsParameters | None = None,
-    ) -> None:
+    def reset(self, rows: np.ndarray, state: RobotState, parameters: DynamicsParameters | None = None) -> None:
         """See :meth:`physai.physics.Physics.reset`."""
         n = len(self._joints)
-        for row, q, qd in zip(rows.tolist(), joint_position.tolist(), joint_velocity.tolist(), strict=True):
+        columns = rows.tolist(), state.joint_position.tolist(), state.joint_velocity.tolist()
+        for row, q, qd in zip(*columns, strict=True):
             client, body = self._row[row]
             self._position[row * n : (row + 1) * n], self._velocity[row * n : (row + 1) * n] = q, qd
             for joint, position, velocity in zip(self._joints, q, qd, strict=True):
@@ -126,28 +119,28 @@ class PyBulletPhysics:
         limit, friction, gain = (
             self._parameters[key][rows] for key in ("effort_limit", "joint_friction", "velocity_gain")
         )
+        # Of the missing velocity, each substep makes up for as much as all of them shall together.
+        gain = 1.0 - (1.0 - np.minimum(gain, 1.0)) ** (1.0 / self.substeps)
         speeding, braking = np.maximum(limit - friction, 0.0), np.maximum(limit + friction, 0.0)
         n = len(self._joints)
         for row, *values in zip(rows.tolist(), speeding.tolist(), braking.tolist(), gain.tolist(), strict=True):
             bodies = [self._row[row][1]] * n
             self._motors[row * n : (row + 1) * n] = zip(bodies, self._joints, *values, strict=True)
 
-    def step(self, velocity_command: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def step(self, command: np.ndarray) -> RobotState:
         """See :meth:`physai.physics.Physics.step`."""
         expected = self.num_robots, len(self._joints)
-        if velocity_command.shape != expected:
-            raise ValueError(f"commands of shape {expected} are needed, got {velocity_command.shape}")
-        self._advance(velocity_command.ravel().tolist())
-        return self.joint_state()
+        if command.shape != expected:
+            raise ValueError(f"commands of shape {expected} are needed, got {command.shape}")
+        if self._spec.command is Quantity.JOINT_POSITION:
+            fastest, to_go = self._spec.velocity_limit, command - self.robot_state().joint_position
+            command = np.clip(self._spec.position_gain * to_go, -fastest, fastest)
+        self._advance(command.ravel().tolist())
+        return self.robot_state()
 
-    def step_one(self, velocity_command: list[float]) -> tuple[list[float], list[float]]:
-        """See :meth:`physai.physics.Physics.step_one`."""
-        self._advance(velocity_command)
-        return self._position, self._velocity
-
-    def _advance(self, velocity_command: list[float]) -> None:
+    def _advance(self, targets: list[float]) -> None:
         # One flat pass over all joints of all robots: this loop is what collection costs most.
-        commands = zip(self._motors, velocity_command, self._velocity, strict=True)
+        commands = zip(self._motors, targets, self._velocity, strict=True)
         command, step, read = bullet.setJointMotorControl2, bullet.stepSimulation, bullet.getJointStates
         mode, joints = bullet.VELOCITY_CONTROL, self._joints
         positions: list[float] = []
@@ -166,10 +159,12 @@ class PyBulletPhysics:
                     velocities.append(velocity)
         self._position, self._velocity = positions, velocities
 
-    def joint_state(self) -> tuple[np.ndarray, np.ndarray]:
-        """See :meth:`physai.physics.Physics.joint_state`."""
+    def robot_state(self) -> RobotState:
+        """See :meth:`physai.physics.Physics.robot_state`."""
         shape = self.num_robots, len(self._joints)
-        return np.fromiter(self._position, float).reshape(shape), np.fromiter(self._velocity, float).reshape(shape)
+        return RobotState(
+            np.fromiter(self._position, float).reshape(shape), np.fromiter(self._velocity, float).reshape(shape)
+        )
 
     def parameters(self) -> DynamicsParameters:
         """Masses and damping as PyBullet holds them; the rest as every step hands it to the motors."""
@@ -185,17 +180,18 @@ class PyBulletPhysics:
 
     def state(self) -> dict[str, np.ndarray]:
         """See :meth:`physai.physics.Physics.state`."""
-        position, velocity = self.joint_state()
+        state = self.robot_state()
         return {
-            "joint_position": position,
-            "joint_velocity": velocity,
+            "joint_position": state.joint_position,
+            "joint_velocity": state.joint_velocity,
             **{key: value.copy() for key, value in self._parameters.items()},
         }
 
     def set_state(self, state: dict[str, np.ndarray]) -> None:
         """See :meth:`physai.physics.Physics.set_state`."""
         parameters = {key: state[key] for key in self._parameters}
-        self.reset(np.arange(self.num_robots), state["joint_position"], state["joint_velocity"], parameters)
+        robots = RobotState(state["joint_position"], state["joint_velocity"])
+        self.reset(np.arange(self.num_robots), robots, parameters)
 
     def close(self) -> None:
         """Disconnect all clients."""

@@ -99,13 +99,13 @@ class RandomizationConfig(Config):
         """Whether any of these parameters is drawn."""
         return any(name in self.draws for name in names)
 
-    @property
-    def max_delay(self) -> int:
-        """Longest actuator delay that can be drawn, in control steps."""
-        draw = self.actuator_delay
-        if draw is None:
-            return 0
-        return max(0, math.floor((draw.mean + 5 * draw.std if isinstance(draw, Normal) else draw.high) + 0.5))
+    def without_effect(self, layout: ParameterLayout) -> list[str]:
+        """Name the parameters whose draw changes nothing: a scale of what is zero in the robot's description."""
+        return [
+            name
+            for name, draw in self.draws.items()
+            if draw.operation == "scale" and not layout.nominal[layout.columns[name]].any()
+        ]
 
     def sample(self, rows: int, layout: ParameterLayout, generator: torch.Generator) -> Tensor:
         """Draw ``physics_parameters`` for so many robots, [rows, P], starting from the robot's nominal values.

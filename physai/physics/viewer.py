@@ -1,19 +1,13 @@
 """Pictures of a robot and its goal, from a world of its own: looking never disturbs the simulation."""
 
-import os
-import sys
 from typing import Any
 
 import numpy as np
 import pybullet as bullet
 
-from physai.errors import UserError
 from physai.robots import RobotSpec
 
-
-def has_screen() -> bool:
-    """Whether a window can be opened here."""
-    return not sys.platform.startswith("linux") or bool(os.environ.get("DISPLAY"))
+_OUT_OF_SIGHT = (0.0, 0.0, -100.0)
 
 
 class Viewer:
@@ -27,9 +21,6 @@ class Viewer:
         window: Open a window; otherwise images are rendered on the CPU without a screen.
         width: Of an image, pixels.
         image_height: Of an image, pixels.
-
-    Raises:
-        UserError: If a window is asked for where there is no screen.
     """
 
     def __init__(
@@ -42,8 +33,6 @@ class Viewer:
         width: int = 480,
         image_height: int = 360,
     ) -> None:
-        if window and not has_screen():
-            raise UserError("there is no screen here (DISPLAY is not set): render images instead of a window")
         self._size = width, image_height
         self._window = window
         self._client = bullet.connect(bullet.GUI if window else bullet.DIRECT)
@@ -62,6 +51,7 @@ class Viewer:
         self._markers = [(self._cylinder(tolerance, 0.02, green), floor + 0.01)]
         if upright:
             self._markers.append((self._cylinder(0.2 * tolerance, height, green), 0.5 * height))
+        self._ball = self._body_of(bullet.GEOM_SPHERE, green, radius=tolerance)  # of a goal in space
         half = [1.6 * reach, 1.6 * reach, 0.005]
         plate = self._body_of(bullet.GEOM_BOX, (0.97, 0.97, 0.98, 1), halfExtents=half)
         bullet.resetBasePositionAndOrientation(plate, (0, 0, floor - 0.005), (0, 0, 0, 1), self._client)
@@ -81,12 +71,19 @@ class Viewer:
         return bullet.createMultiBody(baseVisualShapeIndex=shape, physicsClientId=self._client)
 
     def show(self, joint_position: np.ndarray, goal: np.ndarray) -> np.ndarray | None:
-        """Show a pose [n], rad, and a goal [2], m; return an image [height, width, 3] uint8, or None with a window."""
+        """Show a pose [n], rad, and a goal in the plane [2] or in space [3], m.
+
+        Returns:
+            An image [height, width, 3] uint8, or None with a window.
+        """
         for joint, position in zip(self._joints, joint_position.tolist(), strict=True):
             bullet.resetJointState(self._body, joint, position, 0.0, self._client)
-        x, y = goal.tolist()
-        for marker, z in self._markers:
-            bullet.resetBasePositionAndOrientation(marker, (x, y, z), (0, 0, 0, 1), self._client)
+        x, y, *height_of_goal = goal.tolist()
+        flat = not height_of_goal
+        for marker, z in [*self._markers, (self._ball, 0.0 if flat else height_of_goal[0])]:
+            shown = flat != (marker == self._ball)
+            place = (x, y, z) if shown else _OUT_OF_SIGHT
+            bullet.resetBasePositionAndOrientation(marker, place, (0, 0, 0, 1), self._client)
         if self._window:
             return None
         width, height = self._size

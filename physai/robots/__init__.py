@@ -1,6 +1,7 @@
 """What a robot is: its URDF, its limits, its kinematics."""
 
-from physai.robots.kinematics import ForwardKinematics, TipPosition
+from physai.robots.command import JointCommand
+from physai.robots.kinematics import EndEffector, ForwardKinematics
 from physai.robots.spec import RobotConfig, RobotSpec
 
-__all__ = ["ForwardKinematics", "RobotConfig", "RobotSpec", "TipPosition"]
+__all__ = ["EndEffector", "ForwardKinematics", "JointCommand", "RobotConfig", "RobotSpec"]

@@ -79,11 +79,12 @@ class ForwardKinematics(nn.Module):
         return columns[:, :3]
 
 
-class TipPosition:
-    """What :class:`ForwardKinematics` says of the end effector's place in the plane, without torch.
+class EndEffector:
+    """Where the end effectors of many robots are, as :class:`ForwardKinematics` says, without torch.
 
     At every step of a simulation, calling torch costs more than what it computes. The matrices are those of the module;
-    only their product is written again, for one arm in plain numbers and for many in arrays.
+    only their product is written again: in arrays for many robots, and in plain numbers for one, where NumPy's calls
+    cost more than what they compute, too.
 
     Args:
         kinematics: The module.
@@ -94,18 +95,29 @@ class TipPosition:
         # Joint by joint [4, 3 terms, 4]: what each term makes of a point [x, y, z, 1].
         motions = np.stack([term[:, :4].double().numpy() for term in terms], axis=2)
         *before, last = motions
-        joints = before[::-1]  # from the tip to the base
+        self._joints = [np.ascontiguousarray(joint) for joint in before[::-1]]  # from the tip to the base
         self._tip = last[:, :, 3].copy()  # [4, 3 terms]: the tip is the origin of the last link's frame
-        if joints:  # the height in the end is not asked for
-            joints[-1] = joints[-1][:2]
-        self._joints = [np.ascontiguousarray(joint) for joint in joints]
-        self._tip_numbers = self._tip[: 3 if joints else 2].tolist()
+        self._tip_numbers = self._tip[:3].tolist()
         self._joint_numbers = [  # turning moves no origin
-            [(*constant, *cosine[:3], *sine[:3]) for constant, cosine, sine in joint[:3].tolist()] for joint in joints
+            [(*constant, *cosine[:3], *sine[:3]) for constant, cosine, sine in joint[:3].tolist()]
+            for joint in self._joints
         ]
 
-    def of_one(self, joint_position: list[float]) -> list[float]:
-        """Map n joint positions, rad, to x and y, m."""
+    def __call__(self, joint_position: np.ndarray) -> np.ndarray:
+        """Map joint positions [N, n], rad, to positions in the base frame [N, 3], m."""
+        if len(joint_position) == 1:
+            return np.array([self._of_one(joint_position[0].tolist())])
+        terms = np.empty((joint_position.shape[1], 3, len(joint_position)))
+        terms[:, 0] = 1.0
+        np.cos(joint_position.T, out=terms[:, 1])
+        np.sin(joint_position.T, out=terms[:, 2])
+        # einsum adds up in the same order for any number of robots, which matrix products do not.
+        point = np.einsum("it,tk->ik", self._tip, terms[-1])
+        for motion, turned in zip(self._joints, terms[-2::-1], strict=True):
+            point = np.einsum("itj,tk,jk->ik", motion, turned, point)
+        return np.ascontiguousarray(point[:3].T)
+
+    def _of_one(self, joint_position: list[float]) -> list[float]:
         c, s = math.cos(joint_position[-1]), math.sin(joint_position[-1])
         point = [a + b * c + d * s for a, b, d in self._tip_numbers]
         for angle, rows in zip(joint_position[-2::-1], self._joint_numbers, strict=True):
@@ -116,15 +128,3 @@ class TipPosition:
                 for ax, ay, az, at, bx, by, bz, cx, cy, cz in rows
             ]
         return point
-
-    def of_many(self, joint_position: np.ndarray) -> np.ndarray:
-        """Map joint positions [N, n], rad, to x and y, m, [2, N]."""
-        terms = np.empty((joint_position.shape[1], 3, len(joint_position)))
-        terms[:, 0] = 1.0
-        np.cos(joint_position.T, out=terms[:, 1])
-        np.sin(joint_position.T, out=terms[:, 2])
-        # einsum adds up in the same order for one arm and for many, which matrix products do not.
-        point = np.einsum("it,tk->ik", self._tip, terms[-1])
-        for motion, turned in zip(self._joints, terms[-2::-1], strict=True):
-            point = np.einsum("itj,tk,jk->ik", motion, turned, point)
-        return point[:2]

@@ -2,24 +2,33 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from pydantic import Field
 from urdf_parser_py.urdf import Joint
 
-from physai.config import Config, nearest
+from physai.config import Config, PositiveFloat, nearest
 from physai.errors import UserError
 from physai.robots import urdf
+from physai.signals import Quantity, Signal
 
 
 class RobotConfig(Config):
-    """One file of ``conf/robot``."""
+    """One file of ``conf/robot``.
+
+    ``command`` says what drives the joints, ``command_limit`` how fast an action of 1 moves each of them, rad/s, and
+    ``position_gain`` how fast a joint that takes positions closes in on them, 1/s.
+    """
 
     name: str
     urdf: str
     joints: list[str] = Field(min_length=1)
     end_effector: str
     home: list[float]
+    command: Literal["joint_velocity", "joint_position"]
+    command_limit: list[PositiveFloat]
+    position_gain: PositiveFloat
 
 
 @dataclass(frozen=True)
@@ -36,6 +45,9 @@ class RobotSpec:
         position_limit: Lower and upper limit, rad, [n, 2]; infinite for continuous joints.
         velocity_limit: rad/s, [n].
         effort_limit: N·m, [n].
+        command: What drives the joints: their velocities or their positions.
+        command_limit: How fast an action of 1 moves each joint, rad/s, [n].
+        position_gain: Of joints that take positions, 1/s: they want to move at this times the distance to go.
         damping: N·m·s/rad, [n].
         friction: Coulomb friction, N·m, [n].
         chain: Joints from the base to the end effector, in order.
@@ -52,6 +64,9 @@ class RobotSpec:
     position_limit: np.ndarray
     velocity_limit: np.ndarray
     effort_limit: np.ndarray
+    command: Quantity
+    command_limit: np.ndarray
+    position_gain: float
     damping: np.ndarray
     friction: np.ndarray
     chain: tuple[Joint, ...]
@@ -62,6 +77,24 @@ class RobotSpec:
     def continuous(self) -> np.ndarray:
         """Which joints turn without end, [n]."""
         return np.isinf(self.position_limit[:, 0])
+
+    @property
+    def joint_position(self) -> Signal:
+        """What its encoders tell."""
+        return Signal.of_joints("joint_position", Quantity.JOINT_POSITION, self.joints, *self.position_limit.T)
+
+    @property
+    def joint_velocity(self) -> Signal:
+        """How fast its joints move."""
+        limit = self.velocity_limit
+        return Signal.of_joints("joint_velocity", Quantity.JOINT_VELOCITY, self.joints, -limit, limit)
+
+    @property
+    def joint_command(self) -> Signal:
+        """What it is driven by."""
+        limit, (lower, upper) = self.command_limit, self.position_limit.T
+        bounds = (-limit, limit) if self.command is Quantity.JOINT_VELOCITY else (lower, upper)
+        return Signal.of_joints(f"{self.command.value}_command", self.command, self.joints, *bounds)
 
     @classmethod
     def from_config(cls, config: RobotConfig) -> "RobotSpec":
@@ -93,8 +126,15 @@ class RobotSpec:
         joints = [by_name[name] for name in config.joints]
         for joint in joints:
             _check_driven(path, joint)
-        if len(config.home) != len(joints):
-            raise UserError(f"robot '{config.name}': home has {len(config.home)} values for {len(joints)} joints")
+        for key, values in (("home", config.home), ("command_limit", config.command_limit)):
+            if len(values) != len(joints):
+                raise UserError(f"robot '{config.name}': {key} has {len(values)} values for {len(joints)} joints")
+        for joint, speed in zip(joints, config.command_limit, strict=True):
+            if speed > joint.limit.velocity:
+                raise UserError(
+                    f"robot '{config.name}': command_limit: {speed:g} rad/s is beyond the limit of '{joint.name}', "
+                    f"{joint.limit.velocity:g} rad/s"
+                )
 
         moving = [links[link] for link in _links_below(config.joints[0], robot.joints, by_name)]
         for link in moving:
@@ -112,6 +152,9 @@ class RobotSpec:
             position_limit=np.array([_position_limit(joint) for joint in joints]),
             velocity_limit=np.array([joint.limit.velocity for joint in joints], dtype=np.float64),
             effort_limit=np.array([joint.limit.effort for joint in joints], dtype=np.float64),
+            command=Quantity(config.command),
+            command_limit=np.array(config.command_limit, dtype=np.float64),
+            position_gain=config.position_gain,
             damping=np.array([_dynamics(joint, "damping") for joint in joints]),
             friction=np.array([_dynamics(joint, "friction") for joint in joints]),
             chain=tuple(chain),

@@ -1,24 +1,23 @@
 """Reach: bring the end effector to a point of the base frame's x-y plane."""
 
 import math
-from collections.abc import Iterable
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 import torch
 from pydantic import Field
-from torch import Tensor, nn
+from torch import Tensor
 
 from physai.config import Count, NonNegativeFloat, PositiveFloat
 from physai.errors import UserError
-from physai.robots import ForwardKinematics, RobotSpec
+from physai.physics import RobotState
+from physai.robots import EndEffector, ForwardKinematics, RobotSpec
+from physai.signals import Quantity, Ring, Signal, Tolerance
+from physai.tasks.interface import ObservationModule, Step, Task
 
-Columns = Iterable[Any]
-"""Numbers, or arrays of one shape."""
 
-
-class ReachObservation(nn.Module):
-    """From what a robot senses to what its policy sees; scriptable, and part of the exported policy.
+class ReachObservation(ObservationModule):
+    """Joints, end effector and goal, and what helps to bring them together.
 
     The observation is ``[q, qd, ee_x, ee_y, goal_x, goal_y]``. Features say the same in terms that a small network
     learns from quickly: sine and cosine of the joints, the error e = goal - ee, and Jᵀe, the direction in joint space
@@ -63,114 +62,86 @@ class ReachObservation(nn.Module):
         return observation, features
 
     @torch.jit.export
-    def distance(self, joint_position: Tensor, goal: Tensor) -> Tensor:
-        """Distance of the end effector to the goal in the plane, m: [N, n] rad and [N, 2] m to [N, 1]."""
+    def error(self, joint_position: Tensor, goal: Tensor) -> Tensor:
+        """Map positions [N, n] rad and goals [N, 2] m to the distance of the end effector in the plane, m, [N, 1]."""
         end_effector = self.kinematics(joint_position).narrow(1, 0, 2)
         return torch.linalg.vector_norm(end_effector - goal, dim=1, keepdim=True)
 
 
-class Reach:
+class Reach(Task):
     """Goals on a ring around the base; reward is minus the distance, plus a bonus at the goal, which ends the episode.
 
     Args:
+        spec: The robot.
+        kinematics: Its forward kinematics.
         goal_radius: Inner and outer radius of the ring, m.
         tolerance: Distance that counts as reached, m.
         success_reward: Bonus at the goal.
         max_steps: Control steps until an episode is truncated.
-        start_spread: Episodes start uniformly within the home pose plus or minus this, rad, one value a joint.
-    """
 
-    goal_size = 2
+    Raises:
+        UserError: If the robot cannot reach the goals.
+    """
 
     def __init__(
         self,
+        spec: RobotSpec,
+        kinematics: ForwardKinematics,
         goal_radius: Annotated[list[PositiveFloat], Field(min_length=2, max_length=2)],
         tolerance: PositiveFloat,
         success_reward: NonNegativeFloat,
         max_steps: Count,
-        start_spread: list[NonNegativeFloat],
     ) -> None:
-        self.goal_radius = goal_radius
-        self.tolerance = tolerance
-        self.success_reward = success_reward
-        self.max_steps = max_steps
-        self.start_spread = start_spread
-
-    @property
-    def goal_region(self) -> tuple[float, float]:
-        """Nearest and farthest goal from the origin of the base frame, m."""
-        return self.goal_radius[0], self.goal_radius[1]
-
-    def check(self, spec: RobotSpec, kinematics: ForwardKinematics) -> None:
-        """Raise a UserError if this robot cannot do the task."""
-        inner, outer = self.goal_radius
+        inner, outer = goal_radius
         if inner >= outer:
             raise UserError(f"env.task.goal_radius: the inner radius {inner} must be below the outer radius {outer}")
         if outer > kinematics.reach:
             raise UserError(
                 f"env.task.goal_radius: {outer} m is beyond the reach of '{spec.name}', {kinematics.reach:.3f} m"
             )
-        if len(self.start_spread) != len(spec.joints):
-            raise UserError(f"env.task.start_spread has {len(self.start_spread)} values for {len(spec.joints)} joints")
+        self.region = Ring(inner, outer)
+        low, high = (tuple(bound.tolist()) for bound in self.region.bounds)
+        self.goal = Signal("goal", Quantity.POSITION, (2,), low, high, ("x", "y"), spec.base)
+        self.tolerances = (Tolerance("distance", "m", tolerance),)
+        self.module = ReachObservation(spec, kinematics, tolerance)
+        self.observation = _observation(spec, self.goal, kinematics.reach)
+        self.max_steps = max_steps
+        self._success_reward = success_reward
+        self._end_effector = EndEffector(kinematics)
+        self._continuous = spec.continuous.nonzero()[0]
 
-    def sample_goal(self, rows: int, generator: torch.Generator) -> np.ndarray:
-        """Draw goals [rows, 2], m: angle uniform in [0, 2π), radius uniform between the ring's radii."""
-        draw = torch.rand(rows, 2, generator=generator).numpy()
-        angle = 2 * math.pi * draw[:, :1]
-        inner, outer = self.goal_radius
-        radius = inner + (outer - inner) * draw[:, 1:]
-        return radius * np.concatenate([np.cos(angle), np.sin(angle)], axis=1)
+    def success(self, step: Step) -> np.ndarray:
+        """Whether the end effector is near enough."""
+        return step.held > 0
 
-    def sample_start(self, rows: int, spec: RobotSpec, generator: torch.Generator) -> np.ndarray:
-        """Draw joint positions [rows, n], rad, around the home pose and within the limits."""
-        if not any(self.start_spread):
-            # Nothing is drawn: a seed gives the same goals to robots one after the other as to robots side by side.
-            return np.tile(spec.home, (rows, 1))
-        draw = torch.rand(rows, len(spec.joints), generator=generator, dtype=torch.float64).numpy()
-        start = spec.home + (2 * draw - 1) * np.array(self.start_spread)
-        lower, upper = spec.position_limit.T
-        return np.minimum(np.maximum(start, lower), upper)
+    def terminated(self, step: Step, success: np.ndarray) -> np.ndarray:
+        """Reaching the goal ends the episode."""
+        return success
 
-    def observation(self, spec: RobotSpec, kinematics: ForwardKinematics) -> ReachObservation:
-        """Return the module that makes observation and features for a robot."""
-        return ReachObservation(spec, kinematics, self.tolerance)
+    def rewards(self, step: Step, success: np.ndarray) -> dict[str, np.ndarray]:
+        """Minus the distance, m, and the bonus."""
+        return {"distance": -step.error[:, 0], "success": self._success_reward * success}
 
-    def observation_bounds(self, spec: RobotSpec, kinematics: ForwardKinematics) -> tuple[Tensor, Tensor]:
-        """Lower and upper bound of an observation, [2n + 4] each; with room, for joint limits are not walls."""
-        velocity = 2.0 * torch.from_numpy(spec.velocity_limit)
-        limits = torch.from_numpy(spec.position_limit).clone()
-        limits[spec.continuous] = torch.tensor([-math.pi, math.pi], dtype=limits.dtype)
-        lower, upper = limits.T
-        end_effector = torch.full((2,), kinematics.reach * 1.01)
-        goal = torch.full((2,), self.goal_radius[1])
-        return (
-            torch.cat([lower - 0.5, -velocity, -end_effector, -goal]).float(),
-            torch.cat([upper + 0.5, velocity, end_effector, goal]).float(),
-        )
+    # The same as the module says, without the cost of torch's calls.
 
-    # What follows is asked at every step: of one robot in plain numbers, of many in arrays.
+    def error(self, state: RobotState, goal: np.ndarray) -> np.ndarray:
+        """Return the distance in the plane, m, [N, 1]."""
+        apart = self._end_effector(state.joint_position)[:, :2] - goal
+        return np.hypot(apart[:, :1], apart[:, 1:])
 
-    def observe(
-        self, continuous: list[int], joint_position: Columns, joint_velocity: Columns, tip: Columns, goal: Columns
-    ) -> Columns:
-        """The observation of :class:`ReachObservation` from the true state, 2n + 4 numbers or arrays.
+    def observe(self, state: RobotState, goal: np.ndarray) -> np.ndarray:
+        """Return the observation, [N, 2n + 4]."""
+        end_effector = self._end_effector(state.joint_position)[:, :2]
+        seen = np.concatenate([state.joint_position, state.joint_velocity, end_effector, goal], axis=1)
+        for joint in self._continuous:
+            seen[:, joint] = (seen[:, joint] + math.pi) % (2 * math.pi) - math.pi
+        return seen.astype(np.float32)
 
-        Args:
-            continuous: Which joints turn without end.
-            joint_position: n, rad.
-            joint_velocity: n, rad/s.
-            tip: End effector in the plane, 2, m.
-            goal: 2, m.
-        """
-        seen = [*joint_position, *joint_velocity, *tip, *goal]
-        for joint in continuous:
-            seen[joint] = (seen[joint] + math.pi) % (2 * math.pi) - math.pi
-        return seen
 
-    def success(self, distance: Any) -> Any:
-        """Whether the goal is reached."""
-        return distance < self.tolerance
-
-    def reward(self, distance: Any, success: Any) -> Any:
-        """Reward of the step that led here."""
-        return self.success_reward * success - distance
+def _observation(spec: RobotSpec, goal: Signal, reach: float) -> Signal:
+    """What the policy sees; with room, for joint limits are not walls."""
+    lower, upper = np.where(spec.continuous, [[-math.pi], [math.pi]], spec.position_limit.T)
+    velocity, end_effector, (goal_low, goal_high) = 2.0 * spec.velocity_limit, np.full(2, reach * 1.01), goal.bounds
+    low = np.concatenate([lower - 0.5, -velocity, -end_effector, goal_low])
+    high = np.concatenate([upper + 0.5, velocity, end_effector, goal_high])
+    return Signal("observation", Quantity.VIEW, (len(low),), tuple(low.tolist()), tuple(high.tolist()))

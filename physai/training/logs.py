@@ -65,13 +65,21 @@ class RunLog:
 
     Args:
         run_dir: The run folder.
+        reward_terms: Names of the terms of the reward.
         make_logger: Returns a TorchRL logger; called by ``open``, or for the first metrics.
         state: From ``state``, to continue a run.
     """
 
-    def __init__(self, run_dir: Path, make_logger: Callable[[], Any], state: dict[str, Any] | None = None) -> None:
+    def __init__(
+        self,
+        run_dir: Path,
+        reward_terms: Sequence[str],
+        make_logger: Callable[[], Any],
+        state: dict[str, Any] | None = None,
+    ) -> None:
         state = state or {"metrics": 0, "columns": [], "episodes": 0}
         self._run_dir = run_dir
+        self._rewards = [f"reward/{term}" for term in reward_terms]
         self._make_logger = make_logger
         self._logger: Any = None
         self._metrics: CsvLog | None = None
@@ -87,15 +95,17 @@ class RunLog:
         if not len(time):
             return {}
         frames = first_frame + (time + 1) * robots
-        returns = after.get("episode_return")[robot, time, 0]
+        rewards = after.get("episode_rewards")[robot, time]
+        returns = rewards.sum(dim=1)
         lengths = after.get("episode_length")[robot, time, 0]
-        success = after.get("terminated")[robot, time, 0]
+        success = after.get("success")[robot, time, 0]
         for row in zip(frames.tolist(), returns.tolist(), lengths.tolist(), success.int().tolist(), strict=True):
             self._episodes.write(**dict(zip(EPISODE_COLUMNS, row, strict=True)))
         return {
             "episode/return": float(returns.mean()),
             "episode/length": float(lengths.double().mean()),
             "episode/success_rate": float(success.double().mean()),
+            **dict(zip(self._rewards, rewards.double().mean(dim=0).tolist(), strict=True)),
         }
 
     def open(self) -> None:
@@ -106,7 +116,7 @@ class RunLog:
     def metrics(self, frames: int, iteration: int, values: dict[str, float]) -> None:
         """Write down an iteration."""
         if self._metrics is None:
-            episode = ("episode/return", "episode/length", "episode/success_rate")
+            episode = ("episode/return", "episode/length", "episode/success_rate", *self._rewards)
             rest = [key for key in values if key not in (*episode, *EVALUATION_COLUMNS, *TIME_COLUMNS)]
             columns = ["frames", "iteration", *episode, *rest, *EVALUATION_COLUMNS, *TIME_COLUMNS]
             self._metrics = CsvLog(self._run_dir / "metrics.csv", columns)

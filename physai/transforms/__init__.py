@@ -1,17 +1,17 @@
-"""TorchRL transforms between the robot's sensors and the policy's input, and between its output and the motors."""
+"""TorchRL transforms between the robot's sensors and the policy's input."""
 
-from physai.transforms.actuation import ActuatorDelay
 from physai.transforms.memory import Memory
-from physai.transforms.normalization import ObservationNormalization
+from physai.transforms.normalization import Normalizer, ObservationNormalization, RunningStatistics
 from physai.transforms.observation import Observation
 from physai.transforms.randomization import DomainRandomization
 from physai.transforms.sensing import SensorModel
 
 __all__ = [
-    "ActuatorDelay",
     "DomainRandomization",
     "Memory",
+    "Normalizer",
     "Observation",
     "ObservationNormalization",
+    "RunningStatistics",
     "SensorModel",
 ]

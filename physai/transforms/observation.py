@@ -2,9 +2,10 @@
 
 import torch
 from tensordict import TensorDictBase
-from torch import nn
 from torchrl.data import Composite, Unbounded
 from torchrl.envs.transforms import Transform
+
+from physai.tasks import ObservationModule
 
 
 class Observation(Transform):
@@ -14,7 +15,7 @@ class Observation(Transform):
         module: The task's observation module, the same that the exported policy carries.
     """
 
-    def __init__(self, module: nn.Module) -> None:
+    def __init__(self, module: ObservationModule) -> None:
         super().__init__(in_keys=["joint_position", "joint_velocity", "goal"], out_keys=["observation", "features"])
         self.module = module
 

@@ -23,7 +23,7 @@ def test_the_env_written_by_hand_is_a_gymnasium_env(by_hand):
 
 
 def test_the_env_written_by_hand_is_the_same_task_as_physai_s(by_hand):
-    ours = gymnasium.make(gym.NAME, overrides=["env.task.start_spread=[0.0,0.0]"])
+    ours = gymnasium.make(gym.NAME, overrides=["env.start.spread=[0.0,0.0]"])
     simulation = ours.unwrapped.simulation
     by_hand.spread = [0.0, 0.0]
     by_hand.reset(seed=0)

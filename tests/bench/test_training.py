@@ -194,7 +194,7 @@ def test_who_does_not_arrive_is_ahead_of_nobody():
 @pytest.mark.slow
 def test_all_learners_race(monkeypatch):
     monkeypatch.setattr(training, "GOALS", 20)
-    monkeypatch.setattr(training, "JUDGE_EVERY", 4096)
+    monkeypatch.setattr(training, "JUDGE_EVERY", 1024)
     reacher = training.reacher
     monkeypatch.setattr(
         training, "reacher", lambda seed, *overrides: reacher(seed, *overrides, SHORT, "total_frames=4096")

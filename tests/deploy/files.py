@@ -3,13 +3,10 @@
 import io
 import json
 import zipfile
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-import torch
 
 from physai.deploy import Policy, PolicyError, load_policy
 from physai.deploy.archive import content_sha256
@@ -48,21 +45,6 @@ def sign(records: dict[str, bytes]) -> dict[str, bytes]:
     metadata = json.loads(records[METADATA]) | {"content_sha256": content_sha256(pack(records))}
     metadata["metadata_sha256"] = metadata_sha256(metadata)
     return records | {METADATA: json.dumps(metadata).encode()}
-
-
-def described(content: bytes, change: Callable[[dict[str, Any]], object]) -> bytes:
-    """The file with changed metadata."""
-    good = records(content)
-    metadata = json.loads(good[METADATA])
-    change(metadata)
-    return pack(sign(good | {METADATA: json.dumps(metadata).encode()}))
-
-
-def save(scripted: torch.jit.ScriptModule, metadata: str | None = None) -> bytes:
-    """The content of a policy file."""
-    written = io.BytesIO()
-    torch.jit.save(scripted, written, _extra_files=None if metadata is None else {"metadata.json": metadata})
-    return pack({name: data for name, data in records(written.getvalue()).items() if not name.endswith(".debug_pkl")})
 
 
 def commands(policy: Policy, golden: dict[str, np.ndarray]) -> np.ndarray:

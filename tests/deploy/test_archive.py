@@ -19,9 +19,10 @@ import pytest
 import torch
 from torch import Tensor, nn
 
+from physai.artifact.module import save
 from physai.deploy import Policy, PolicyError, load_policy, read_metadata
 from physai.deploy.archive import MAX_BYTES
-from tests.deploy.files import METADATA, commands, pack, records, refusal, save, sign
+from tests.deploy.files import METADATA, commands, pack, records, refusal, sign
 
 COMPRESSED = 0x08
 

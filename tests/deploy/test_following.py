@@ -11,10 +11,10 @@ import torch
 from physai.config import compose, validate
 from physai.deploy import Controller, ControllerConfig, Goal, JointState, State
 from physai.deploy.following import Following
-from physai.physics import ParameterLayout, RandomizationConfig
+from physai.physics import ParameterLayout, RandomizationConfig, RobotState
 from physai.physics.pybullet import PyBulletPhysics
 from physai.robots import RobotSpec
-from tests.deploy.troubled import Troubled
+from tests.deploy.conftest import Troubled
 
 PERIOD = 0.02
 NAMES = ("joint1", "joint2")
@@ -185,7 +185,7 @@ def test_states_that_come_seldom_and_not_on_time_are_measured_at_their_own_time(
     speed = np.array([2.0, -0.5])
     for tick in range(100):
         now = tick * PERIOD
-        following.commanded(now, speed * PERIOD)
+        following.commanded(now, speed)
         if tick % every == every - 1:
             motion = np.concatenate([speed * (now - age), speed])
             assert following.heard(now - age, motion) is None
@@ -298,11 +298,12 @@ def simulate(policy, reacher, robots, seconds, randomization, seed, change=None)
     if change is not None:
         change(dynamics)
     physics = PyBulletPhysics(spec, robots, PERIOD / 2)
-    physics.reset(np.arange(robots), start, np.zeros((robots, 2)), dynamics)
+    physics.reset(np.arange(robots), RobotState(start, np.zeros((robots, 2))), dynamics)
     controllers = [Controller(policy, stopwatch=lambda: 0.0) for _ in range(robots)]
     sent, late = np.zeros((7, robots, 2)), np.round(2 * delay[:, 0]).astype(int)
     for tick in range(round(seconds / PERIOD)):
-        position, velocity = physics.joint_state()
+        state = physics.robot_state()
+        position, velocity = state.joint_position, state.joint_velocity
         position = position + offset + shaky * draw.standard_normal((robots, 2))
         velocity = velocity + jerky * draw.standard_normal((robots, 2))
         commands = np.zeros((robots, 2))

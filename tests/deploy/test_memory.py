@@ -1,12 +1,15 @@
 """Policies that remember, on a robot: what is loaded, what is refused, and when the controller begins anew."""
 
+import json
 import math
 
 import numpy as np
 import pytest
 
 from physai.deploy import Controller, ControllerConfig, Goal, JointState, State, load_policy
-from tests.deploy.files import described, refusal
+from physai.deploy.metadata import describe_signal
+from physai.signals import Quantity, Signal
+from tests.deploy.files import METADATA, pack, records, refusal, sign
 
 PERIOD, SIZE = 0.02, 32
 GOAL, OTHER_GOAL = Goal([-0.4, -0.1], "base"), Goal([-0.1, -0.4], "base")
@@ -43,20 +46,28 @@ def test_in_torchrl_code_it_has_its_keys(recurrent):
     assert module.out_keys == ["joint_velocity_command", "new_memory"]
 
 
+def change(content, edit):
+    parts = records(content)
+    metadata = json.loads(parts[METADATA])
+    edit(metadata)
+    return pack(sign(parts | {METADATA: json.dumps(metadata).encode()}))
+
+
 def set_size(size):
     def edit(metadata):
-        metadata["inputs"][-1]["shape"] = metadata["outputs"][-1]["shape"] = size
+        for side in ("inputs", "outputs"):
+            metadata[side][-1]["shape"] = size
 
     return edit
 
 
 def forget_the_output(metadata):
-    del metadata["outputs"][-1]
+    metadata["outputs"].pop()
 
 
 def forget_the_memory(metadata):
-    for part in ("inputs", "outputs"):
-        del metadata[part][-1]
+    for side in ("inputs", "outputs"):
+        metadata[side].pop()
 
 
 def other_golden_memory(key):
@@ -73,37 +84,34 @@ def golden_nan(metadata):
 @pytest.mark.parametrize(
     ("edit", "message"),
     [
-        (set_size([0]), "inputs.3.shape must be a list of positive whole numbers"),
-        (set_size([True]), "inputs.3.shape must be a list of positive whole numbers"),
-        (set_size([10**9]), "inputs.3.shape must be of 1 to 65,536 numbers"),
-        (set_size(32), "inputs.3.shape must be a list of positive whole numbers"),
-        (set_size([4, 8]), "'memory' must have one axis"),
+        (set_size([0]), "inputs.3.shape must be positive integers"),
+        (set_size([True]), "inputs.3.shape must be positive integers"),
+        (set_size([10**9]), "inputs.3.shape must be positive integers"),
+        (set_size([60000, 60000]), "inputs.3 has 3,600,000,000 numbers, more than 65,536"),
+        (set_size(32), "inputs.3.shape must be a list"),
         (set_size([31]), "golden.memory must have the shape [32, 31], not [32, 32]"),
-        (forget_the_output, "outputs must be ['joint_velocity_command', 'new_memory']"),
-        (lambda metadata: metadata["inputs"].pop(), "outputs must be ['joint_velocity_command']"),
-        (lambda metadata: metadata["outputs"][-1].update(shape=[31]), "'new_memory' like 'memory'"),
+        (forget_the_output, "there is 'memory' among the inputs, and no 'new_memory' among the outputs"),
+        (lambda metadata: metadata["inputs"].pop(), "a policy that remembers takes 'memory' and gives as much"),
         (forget_the_memory, "its forward takes ['joint_position', 'joint_velocity', 'goal', 'memory'], not"),
         (lambda metadata: metadata["golden"].pop("memory"), "golden.memory is missing"),
-        (golden_nan, "golden.new_memory must hold numbers"),
+        (golden_nan, "golden.new_memory must be finite"),
         (other_golden_memory("memory"), "a golden pair differs by"),
-        (other_golden_memory("new_memory"), "a golden pair differs by 0.01 in new_memory"),
+        (other_golden_memory("new_memory"), "the new_memory of a golden pair differs by 0.01"),
     ],
 )
 def test_metadata_that_do_not_fit_its_memory_are_refused(recurrent_content, path, edit, message):
-    path.write_bytes(described(recurrent_content, edit))
+    path.write_bytes(change(recurrent_content, edit))
     assert message in refusal(path)
 
 
 def test_a_policy_without_memory_that_claims_one_is_refused(content, path):
     def claim(metadata):
-        memory = {"name": "memory", "quantity": "memory", "unit": "", "shape": [1]}
-        memory |= {"low": [], "high": [], "labels": [], "frame": ""}
-        metadata["inputs"].append(memory)
-        metadata["outputs"].append(memory | {"name": "new_memory"})
+        for side, name in (("inputs", "memory"), ("outputs", "new_memory")):
+            metadata[side].append(describe_signal(Signal(name, Quantity.MEMORY, (1,))))
         pairs = len(metadata["golden"]["goal"])
         metadata["golden"] |= {"memory": [[0.0]] * pairs, "new_memory": [[0.0]] * pairs}
 
-    path.write_bytes(described(content, claim))
+    path.write_bytes(change(content, claim))
     assert "its forward takes ['joint_position', 'joint_velocity', 'goal'], not" in refusal(path)
 
 

@@ -12,10 +12,11 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
 
+from physai.artifact.module import save
 from physai.deploy import PolicyError, load_policy, read_metadata
 from physai.deploy.archive import content_sha256
 from physai.deploy.metadata import metadata_sha256
-from tests.deploy.files import METADATA, commands, described, pack, records, refusal, save, sign
+from tests.deploy.files import METADATA, commands, pack, records, refusal, sign
 
 # --- the policy that was exported
 
@@ -44,14 +45,11 @@ def test_another_number_of_values_than_joints_is_no_input(policy, wrong):
 
 
 def test_the_error_is_the_distance_of_the_arm(policy):
-    def distance(position, goal):
-        (error,) = policy.error(position, goal)
-        return error
-
-    reach = distance([0.0, 0.0], [0.0, 0.0])
-    assert reach == pytest.approx(distance([1.0, 0.0], [0.0, 0.0]), abs=1e-5)  # the first joint turns all
-    assert distance([0.0, 0.0], [reach, 0.0]) == pytest.approx(0.0, abs=1e-5)
-    assert distance([0.0, 0.0], [reach - 0.1, 0.0]) == pytest.approx(0.1, abs=1e-5)
+    reach = policy.error([0.0, 0.0], [0.0, 0.0])
+    assert reach == pytest.approx(policy.error([1.0, 0.0], [0.0, 0.0]), abs=1e-5)  # the first joint turns all
+    reach = reach.item()
+    assert policy.error([0.0, 0.0], [reach, 0.0]) == pytest.approx(0.0, abs=1e-5)
+    assert policy.error([0.0, 0.0], [reach - 0.1, 0.0]) == pytest.approx(0.1, abs=1e-5)
 
 
 def test_in_torchrl_code_it_gives_the_same_commands(policy):
@@ -142,6 +140,14 @@ def test_a_hash_beside_that_is_a_dead_link_is_not_passed_over(content, path):
 # --- its robot
 
 
+def described(content: bytes, change) -> bytes:
+    """The file with changed metadata."""
+    good = records(content)
+    metadata = json.loads(good[METADATA])
+    change(metadata)
+    return pack(sign(good | {METADATA: json.dumps(metadata).encode()}))
+
+
 def test_the_joints_that_are_expected_are_accepted(content, path):
     path.write_bytes(content)
     for joints in (("joint1", "joint2"), ["joint1", "joint2"]):
@@ -149,8 +155,9 @@ def test_the_joints_that_are_expected_are_accepted(content, path):
 
 
 def swap_joints(metadata):
-    for joints in (metadata["robot"]["joints"], *(s["labels"] for s in metadata["inputs"] + metadata["outputs"])):
-        joints.sort(reverse=True)
+    for labels in (metadata["robot"]["joints"], *(one["labels"] for one in metadata["inputs"] + metadata["outputs"])):
+        if "joint1" in labels:
+            labels.reverse()
 
 
 def test_swapped_joints_are_called_in_another_order(content, path):
@@ -167,7 +174,7 @@ def test_another_robots_joints_are_refused(content, path, joints):
 
 def test_another_format_version_is_refused_with_the_path(content, path):
     path.write_bytes(described(content, lambda metadata: metadata.update(format_version=1)))
-    assert "format version 1; this physai reads 2: export the policy again with it" in refusal(path)
+    assert "format version 1" in refusal(path)
 
 
 # --- altered weights
@@ -181,7 +188,7 @@ def altered(content: bytes, name: str, by: float) -> bytes:
     return save(module, records(content)[METADATA].decode())
 
 
-WEIGHTS = ("network.0.weight", "network.2.bias", "network.4.weight", "normalizer.loc", "command_limit")
+WEIGHTS = ("network.0.weight", "network.2.bias", "network.4.weight", "normalizer.loc", "command.scale")
 
 
 @pytest.mark.parametrize("name", WEIGHTS)
@@ -210,7 +217,7 @@ def test_a_command_that_differs_from_the_golden_one_is_refused(content, path):
         metadata["golden"]["joint_velocity_command"][-1][0] += 1e-3
 
     path.write_bytes(described(content, change))
-    assert "a golden pair differs by 0.001 rad/s" in refusal(path)
+    assert "the joint_velocity_command of a golden pair differs by 0.001:" in refusal(path)
 
 
 # --- other modules in the dress of a policy
@@ -373,17 +380,9 @@ def test_a_command_that_is_no_number_in_a_few_of_the_golden_pairs_is_refused(con
     assert "a golden pair differs by nan" in refusal(path)
 
 
-def test_an_error_of_another_size_is_refused(content, path):
+def test_errors_that_are_too_many_is_refused(content, path):
     path.write_bytes(disguise(LongError(), content, forged=True, golden=golden_positions(content)))
     assert "it gives float32 [2], not float32 [1]" in refusal(path)
-
-
-def test_an_error_that_differs_from_the_golden_one_is_refused(content, path):
-    def change(metadata):
-        metadata["golden"]["error"][-1][0] += 1e-3
-
-    path.write_bytes(described(content, change))
-    assert "a golden pair differs by 0.001 in error" in refusal(path)
 
 
 # --- what reading metadata does, and what loading imports

@@ -7,6 +7,7 @@ from operator import mul
 import numpy as np
 
 from physai.deploy import Controller, JointState, State
+from physai.signals import Quantity
 from tests.deploy.conftest import Troubled
 
 PERIOD = 0.02
@@ -23,17 +24,20 @@ class Analytic:
     def __init__(self, metadata):
         self.metadata, self.sha256 = metadata, ""
 
-    def distance(self, position, goal):
+    def error(self, position, goal):
         q1, q2 = position.tolist()
         x, y = 0.3 * math.cos(q1) + 0.25 * math.cos(q1 + q2), 0.3 * math.sin(q1) + 0.25 * math.sin(q1 + q2)
-        return math.hypot(x - goal[0], y - goal[1])
+        return np.array([math.hypot(x - goal[0], y - goal[1])])
 
-    def __call__(self, position, velocity, goal):
+    def __call__(self, position, velocity, goal, *last_command):
         x, y = goal.tolist()
         cosine = (x * x + y * y - 0.1525) / 0.15
         elbow = math.acos(min(1.0, max(-1.0, cosine)))
         shoulder = math.atan2(y, x) - math.atan2(0.25 * math.sin(elbow), 0.3 + 0.25 * math.cos(elbow))
-        return np.clip(4.0 * (np.array([shoulder, elbow]) - position), -2.0, 2.0).astype(np.float32)
+        velocity = np.clip(4.0 * (np.array([shoulder, elbow]) - position), -2.0, 2.0)
+        if last_command:
+            return (last_command[0] + PERIOD * velocity).astype(np.float32)
+        return velocity.astype(np.float32)
 
 
 class Motion:
@@ -132,8 +136,12 @@ class World:
         self.policy, self.log, self.way = Troubled(policy), log, way
         self.controller = Controller(self.policy, config, self.policy.stopwatch)
         self.policy.stop = self.controller.emergency_stop
+        self.tolerance = policy.metadata.tolerances[0].value
+        # Of positions, what they stand for is looked at; their differences are rounded.
+        self.positions = policy.metadata.command.quantity is Quantity.JOINT_POSITION
+        self.rounding = 1e-9 if self.positions else 1e-12
+        self.target, self.stands, self.bound = None, True, False
         self._take_config(config)
-        self.tolerance = policy.metadata.goal_tolerance
         self.lower, self.upper = policy.metadata.position_limit.T.tolist()
         self.turns = [math.isinf(upper) for upper in self.upper]
         self.strongest = policy.metadata.effort_limit.tolist()
@@ -199,15 +207,18 @@ class World:
     def configure(self, config):
         self._tell("configure", config)
         self._take_config(config)
-        share = min(1.0, config.max_velocity / max(*map(abs, self.last), 1e-9))
-        self.last = [velocity * share for velocity in self.last]
+        self.last = self._slowed(self.last)
         self._see_position()
+
+    def _slowed(self, velocities):
+        share = min(1.0, self.config.max_velocity / max(*map(abs, velocities), 1e-9))
+        return [velocity * share for velocity in velocities]
 
     def _take_config(self, config):
         self.config, self.motion = config, Motion(config)
         self.plausible = [speed * config.jump_factor for speed in self.policy.metadata.velocity_limit.tolist()]
         self.acceleration = config.max_acceleration
-        self.fastest = config.max_velocity * (1 + 1e-12)
+        self.fastest = config.max_velocity + self.rounding
         self.slow = min(config.limit_velocity, config.max_velocity)
 
     def _tell(self, what, *arguments):
@@ -223,7 +234,7 @@ class World:
         policy.forget()
         command = self.controller.update(now, state, goal, interlocks)
         if self.log is not None:
-            velocity = None if command.velocity is None else command.velocity.tobytes()
+            velocity = None if command.value is None else command.value.tobytes()
             inputs = (now, state, goal, interlocks)
             self.log.append(("update", inputs, policy.trouble, velocity, command.state, command.reasons))
         stop, elapsed = self._take_time(now)
@@ -247,9 +258,8 @@ class World:
         assert said.count("joint state") == refused
         self._see_age(now, command.reasons, said)
         # The state that follows.
-        velocity = STILL if command.velocity is None else command.velocity.tolist()
         unheard = min(self.heard) == -math.inf
-        assert (command.velocity is None) == (unheard and not self.latched)
+        assert (command.value is None) == (unheard and (self.positions or not self.latched))
         if self.latched:
             expected = self.latched
         elif unheard:
@@ -272,6 +282,9 @@ class World:
         else:
             expected, stop = self._drive(stop, elapsed)
         assert command.state is expected, (command, expected)
+        velocity = STILL if command.value is None else command.value.tolist()
+        if self.positions and command.value is not None:
+            velocity = self._velocity_of(velocity, stop, elapsed)
         assert ("no progress" in said) == (expected is State.HOLD and not self.needed)
         if expected is not self.state:
             self.state = expected
@@ -282,9 +295,36 @@ class World:
         if stop:
             assert velocity == STILL, command
             assert command.reasons or expected is State.REACHED
-        self._check(velocity, elapsed, stop, "a joint" in said)
-        self.velocity = self.last = velocity
+        if not self.bound:  # where the arm is counts more than how fast
+            self._check(velocity, elapsed, stop, "a joint" in said)
+        self.bound = False
+        self.velocity, self.last = velocity, self._slowed(velocity)
         return command
+
+    def _velocity_of(self, target, stop, elapsed):
+        """See that positions are where they may be; return the velocities that they stand for."""
+        begins, before = self.stands, self.target
+        self.target, self.stands = target, stop
+        if stop:
+            if not begins or before is None:  # where the arm is said to be, and from then on the same
+                before = self.accepted
+            assert target == before, (target, before)
+            return STILL
+        velocity, most = [], self.config.max_lead
+        rows = zip(target, self.accepted if begins else before, self.turns, self._against_limits(), strict=True)
+        for new, old, turns, (q, lower, upper) in rows:
+            moved, ahead = new - old, new - q
+            if turns:  # its count may have gone around
+                moved = math.remainder(moved, math.tau)
+            assert abs(ahead) <= most + 1e-9, (new, q)
+            assert min(q, lower) - 1e-9 <= new <= max(q, upper) + 1e-9, (new, q)
+            edges = (most, -most, max(0.0, upper - q), min(0.0, lower - q))  # beyond a limit: where it is
+            bound = any(abs(ahead - edge) < 1e-6 for edge in edges)
+            self.bound |= bound
+            self.seen["held near the arm"] += bound
+            assert elapsed or abs(moved) < 1e-9 or bound
+            velocity.append(moved / elapsed if elapsed else self.last[len(velocity)])
+        return velocity
 
     def finish(self):
         """Compare the controller's counters and what it remembers with the model's."""
@@ -341,7 +381,7 @@ class World:
         return elapsed > 3 * PERIOD, min(elapsed, PERIOD)
 
     def _take_goal(self, goal):
-        numbers, verdict = tuple(float(number) for number in goal.position), "taken"
+        numbers, verdict = tuple(float(number) for number in goal.value), "taken"
         if len(numbers) != 2 or not all(map(math.isfinite, numbers)) or goal.frame != "base":
             return "rejected"
         radius = math.hypot(*numbers)
@@ -527,21 +567,23 @@ class World:
         for new, last, side in zip(velocity, self.last, sides, strict=True):
             assert abs(new) <= self.fastest  # so, it is finite
             self.seen["at a limit"] += side != 0 and not stopped
-            assert new * side <= 0, (new, side)
-            if not stopped and last * side > 0:
+            assert new * side <= self.rounding, (new, side)
+            if not stopped and last * side > self.rounding:
                 self.seen["stopped at a limit"] += 1
-                assert new == 0, (new, last)
+                assert abs(new) <= self.rounding, (new, last)
             elif slowed:  # at once, but not to another direction
-                assert stopped or min(0.0, last - change) - 1e-12 <= new <= max(0.0, last + change) + 1e-12
+                assert (
+                    stopped or min(0.0, last - change) - self.rounding <= new <= max(0.0, last + change) + self.rounding
+                )
             else:
-                assert stopped or abs(new - last) <= change + 1e-12, (new, last, change)
+                assert stopped or abs(new - last) <= change + self.rounding, (new, last, change)
         if not stopped:
             assert any(sides) or not held_back
             assert held_back or not beyond
             if beyond:
                 self.seen["beyond a limit"] += 1
                 self.seen["slowed beyond a limit"] += slowed
-                assert max(map(abs, velocity)) <= self.slow * (1 + 1e-12)
+                assert max(map(abs, velocity)) <= self.slow + self.rounding
 
     def _against_limits(self):
         return zip(self.accepted, self.lower, self.upper, strict=True)

@@ -1,3 +1,5 @@
+from operator import attrgetter
+
 import numpy as np
 import pytest
 import torch
@@ -8,8 +10,10 @@ from torchrl.envs import check_env_specs
 import physai
 from physai.envs.robot_env import RobotEnv
 from physai.errors import UserError
+from physai.transforms import RunningStatistics
 
 NAMES = ["reacher", "kuka_reacher"]
+COMMANDS = ["joint_velocity", "joint_position"]
 RANDOMIZATIONS = ["none", "default", "strong"]
 every_env = [pytest.mark.parametrize("name", NAMES), pytest.mark.parametrize("randomization", RANDOMIZATIONS)]
 
@@ -40,6 +44,11 @@ def play(env, td, steps, seed=0):
         stepped, td = env.step_and_maybe_reset(td.set("action", action))
         seen.append(stepped.clone())
     return torch.stack(seen, 1), td
+
+
+def learn(env, seen):
+    """Renew the statistics, as a learner does."""
+    RunningStatistics(env.normalizer, 0.01).update(seen["observation"])
 
 
 def assert_equal(ours, theirs):
@@ -86,9 +95,12 @@ def test_a_partial_reset_leaves_the_other_rows_of_all_keys_bit_identical(make_en
     for key in ("joint_position", "goal", "observation"):
         assert (after[key][rows] != before[key][rows]).any(-1).all(), key
     assert (after["episode_length"][rows] == 0).all()
-    assert (after["episode_return"][rows] == 0).all()
+    assert (after["episode_rewards"][rows] == 0).all()
+    assert not after["success"][rows].any()
     for key, value in env.state()["simulation"].items():
-        if key != "generator":
+        if key == "delay.commands":  # the steps come first
+            assert torch.equal(value[:, ~rows], state[key][:, ~rows])
+        elif key != "generator":
             assert torch.equal(value[~rows], state[key][~rows]), key
 
 
@@ -105,8 +117,8 @@ def test_rows_that_were_never_reset_go_the_same_way_whatever_happens_to_the_othe
             td = disturbed.reset(td.set("_reset", mask))
         td = disturbed.step(td.set("action", action))["next"]
         quiet_td = quiet.step(quiet_td.set("action", action))["next"]
-        for key in ("joint_position", "joint_velocity", "goal", "episode_return", "distance", "physics_parameters"):
-            ours, theirs = (getattr(env.simulation, key)[kept.numpy()] for env in (disturbed, quiet))
+        for key in ("state.joint_position", "state.joint_velocity", "goal", "episode_rewards", "error"):
+            ours, theirs = (attrgetter(key)(env.simulation)[kept.numpy()] for env in (disturbed, quiet))
             np.testing.assert_array_equal(ours, theirs, err_msg=f"{step} {key}")
         assert torch.equal(td["reward"][kept], quiet_td["reward"][kept])
 
@@ -137,7 +149,10 @@ def test_a_rollout_of_staggered_episodes_is_consistent(make_env, name, randomiza
     assert torch.equal(seen["next", "truncated"], (seen["next", "episode_length"] == 13) & ~seen["next", "terminated"])
     assert not torch.isclose(follows["goal"][over], seen["goal"][:, :-1][over]).all(-1).any()
     torch.testing.assert_close(
-        seen["next", "episode_return"], seen["episode_return"] + seen["next", "reward"], rtol=0, atol=1e-6
+        seen["next", "episode_rewards"].sum(-1, keepdim=True),
+        seen["episode_rewards"].sum(-1, keepdim=True) + seen["next", "reward"],
+        rtol=0,
+        atol=1e-5,
     )
 
 
@@ -181,12 +196,15 @@ def test_the_global_random_numbers_of_torch_play_no_part(make_env):
 
 
 @pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("command", COMMANDS)
 @parametrized
-def test_a_restored_state_continues_bit_for_bit_with_noise_and_delay(make_env, name, randomization, seed):
-    options = {"overrides": ["env.task.max_steps=40", "env.task.tolerance=0.1"]}
+def test_a_restored_state_continues_bit_for_bit_with_noise_and_delay(make_env, name, randomization, command, seed):
+    carried_over = "env.start.carried_over=0.5"
+    steps = ["env.task.max_steps=40", "env.task.tolerance=0.1", f"env.robot.command={command}", carried_over]
+    options = {"overrides": steps}
     original = make_env(name, randomization, seed=seed, **options)
     seen, td = play(original, original.reset(), 45)
-    original.normalization.update(seen["observation"])
+    learn(original, seen)
     _, td = play(original, td, 8, seed=1)
     state = original.state()
     restored = make_env(name, randomization, seed=99, **options)
@@ -204,7 +222,7 @@ def test_a_state_that_was_taken_can_be_gone_back_to_after_any_detour(make_env):
     seen, first = play(env, env.reset(), 15)
     first = first.clone()
     start = env.state()
-    env.normalization.update(seen["observation"])
+    learn(env, seen)
     _, second = play(env, first.clone(), 15, seed=1)
     second = second.clone()
     later = env.state()
@@ -217,13 +235,54 @@ def test_a_state_that_was_taken_can_be_gone_back_to_after_any_detour(make_env):
 
 
 def test_a_seed_gives_the_same_goals_to_robots_one_after_the_other_as_side_by_side(make_env):
-    home = {"randomization": "none", "overrides": ["env.task.start_spread=[0.0,0.0]"]}
+    home = {"randomization": "none", "overrides": ["env.start.spread=[0.0,0.0]"]}
     together, alone = make_env(num_envs=50, **home), make_env(num_envs=1, **home)
     for env in (together, alone):
         env.set_seed(3)
     goals = together.reset()["goal"]
     assert torch.equal(goals, torch.cat([alone.reset()["goal"] for _ in range(50)]))
-    assert not together.simulation.joint_position.any()
+    assert not together.simulation.state.joint_position.any()
+
+
+def test_an_episode_that_is_carried_over_begins_where_the_last_one_ended(make_env):
+    env = make_env(randomization="none", overrides=["env.start.carried_over=1.0", "env.task.max_steps=9"])
+    _, td = play(env, env.reset(), 8)
+    stepped, td = env.step_and_maybe_reset(td.set("action", actions(env, 1)[0]))
+    assert stepped["next", "done"].all()
+    for key in ("joint_position", "joint_velocity"):
+        assert torch.equal(td[key], stepped["next", key])
+    assert not torch.isclose(td["goal"], stepped["next", "goal"]).any()
+
+
+def test_about_as_many_episodes_are_carried_over_as_is_asked_for(make_env):
+    env = make_env(randomization="none", num_envs=400, overrides=["env.start.carried_over=0.3"])
+    before = env.reset()["joint_position"]
+    carried = (env.reset()["joint_position"] == before).all(dim=1).double().mean()
+    assert 0.2 < carried < 0.4
+
+
+def test_a_robot_that_takes_positions_is_told_what_it_was_told_last_and_others_are_not(make_env):
+    assert "last_command" not in make_env().observation_spec.keys()  # noqa: SIM118
+    env = make_env(randomization="none", overrides=["env.robot.command=joint_position", "env.start.spread=[1,1]"])
+    td = env.reset()
+    assert torch.equal(td["last_command"], td["joint_position"])
+    after = env.step(td.set("action", torch.full((8, 2), 0.5)))["next"]
+    torch.testing.assert_close(after["last_command"], td["last_command"] + 0.5 * 2.0 * 0.02)
+
+
+def test_before_the_first_command_arrives_a_robot_that_takes_positions_stays_where_it_is(make_env):
+    delay = {"distribution": "uniform", "low": 3.0, "high": 3.0, "operation": "set"}
+    spec = "{" + ",".join(f"{key}:{value}" for key, value in delay.items()) + "}"
+    env = make_env("reacher", "none", overrides=["env.robot.command=joint_position"])
+    late = make_env(
+        "reacher", "none", overrides=["env.robot.command=joint_position", f"randomization.actuator_delay={spec}"]
+    )
+    for one, moves in ((env, True), (late, False)):
+        td = one.reset()
+        start = td["joint_position"].clone()
+        for _ in range(3):
+            td = one.step(td.set("action", torch.ones(8, 2)))["next"]
+        assert (torch.isclose(td["joint_position"], start, atol=1e-3).all().item()) != moves
 
 
 def test_make_env_works_as_the_readme_shows():
@@ -241,14 +300,16 @@ def test_make_env_works_as_the_readme_shows():
     ("override", "words"),
     [
         ("randomization=stron", ["stron", "did you mean 'strong'?"]),
-        ("env.max_velocty=1.0", ["env.max_velocty", "did you mean 'env.max_velocity'?"]),
+        ("env.control_d=0.01", ["env.control_d", "did you mean 'env.control_dt'?"]),
         ("env.task.tolerence=0.1", ["env.task.tolerence", "did you mean 'env.task.tolerance'?"]),
         ("randomisation=none", ["randomisation", "did you mean 'randomization'?"]),
-        ("env.max_velocity=fast", ["max_velocity", "number", "'fast'"]),
-        ("env.max_velocity=-1.0", ["max_velocity", "greater than 0", "-1.0"]),
+        ("env.control_dt=fast", ["control_dt", "number", "'fast'"]),
+        ("env.robot.command_limit=[1.0,-1.0]", ["command_limit", "greater than 0", "-1.0"]),
         ("env.task.max_steps=0", ["max_steps", "greater than 0", "0"]),
         ("env.robot.joints=[joint1,joint3]", ["joint3", "did you mean 'joint"]),
         ("normalization.clip=0", ["clip", "greater than 0"]),
+        ("env.robot.command=joint_effort", ["command", "'joint_velocity' or 'joint_position'", "'joint_effort'"]),
+        ("env.start.carried_over=2", ["carried_over", "less than or equal to 1", "2"]),
         ("nonsense", ["nonsense"]),
     ],
 )

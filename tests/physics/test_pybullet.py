@@ -5,7 +5,7 @@ import numpy as np
 import pybullet as bullet
 import pytest
 
-from physai.physics import nominal_dynamics
+from physai.physics import RobotState, nominal_dynamics
 from physai.physics.pybullet import PyBulletPhysics
 from physai.robots import RobotSpec
 
@@ -69,12 +69,16 @@ def commands(spec, steps, rows, random):
     return np.repeat(drawn, 10, axis=0)[:steps]
 
 
+def arrays(state):
+    return np.array([state.joint_position, state.joint_velocity])
+
+
 def run(physics, velocity_commands):
-    return np.array([physics.step(command) for command in velocity_commands])
+    return np.array([arrays(physics.step(command)) for command in velocity_commands])
 
 
 def reset_all(physics, q, qd, parameters=None):
-    physics.reset(np.arange(physics.num_robots), q, qd, parameters)
+    physics.reset(np.arange(physics.num_robots), RobotState(q, qd), parameters)
 
 
 def open_clients():
@@ -103,12 +107,12 @@ def test_a_reset_robot_behaves_exactly_like_a_fresh_one_after_heavy_use(spec, ma
     used, fresh = make(spec, 36), make(spec, 36)
     for _ in range(5):
         some = random.permutation(36)[:7]
-        used.reset(some, *start(spec, 7, random), wild(spec, 7, random))
+        used.reset(some, RobotState(*start(spec, 7, random)), wild(spec, 7, random))
         run(used, commands(spec, 60, 36, random))
     rows = np.array([2, 15, 35])
     q, qd = start(spec, 3, random)
     for physics in (used, fresh):
-        physics.reset(rows, q, qd, weak(spec, 3))
+        physics.reset(rows, RobotState(q, qd), weak(spec, 3))
     velocity_commands = commands(spec, 200, 36, random)
     np.testing.assert_array_equal(run(used, velocity_commands)[:, :, rows], run(fresh, velocity_commands)[:, :, rows])
 
@@ -137,10 +141,10 @@ def test_resetting_some_robots_leaves_the_others_bit_identical(spec, make):
     for step, command in enumerate(commands(spec, 300, 36, random)):
         if step % 7 == 0:
             some = random.permutation(others)[:4]
-            before = np.array(disturbed.joint_state())[:, kept]
-            disturbed.reset(some, *start(spec, 4, random), wild(spec, 4, random))
-            np.testing.assert_array_equal(np.array(disturbed.joint_state())[:, kept], before)
-        a, b = np.array(disturbed.step(command)), np.array(quiet.step(command))
+            before = arrays(disturbed.robot_state())[:, kept]
+            disturbed.reset(some, RobotState(*start(spec, 4, random)), wild(spec, 4, random))
+            np.testing.assert_array_equal(arrays(disturbed.robot_state())[:, kept], before)
+        a, b = arrays(disturbed.step(command)), arrays(quiet.step(command))
         np.testing.assert_array_equal(a[:, kept], b[:, kept])
     assert not np.array_equal(a[:, others], b[:, others])
     for key, value in disturbed.parameters().items():
@@ -153,12 +157,12 @@ def test_a_restored_state_continues_bit_for_bit_in_a_fresh_instance(spec, make, 
     original = make(spec, 34)
     reset_all(original, *start(spec, 34, random), wild(spec, 34, random))
     run(original, commands(spec, 100, 34, random))
-    original.reset(np.array([1, 33]), *start(spec, 2, random), weak(spec, 2))
+    original.reset(np.array([1, 33]), RobotState(*start(spec, 2, random)), weak(spec, 2))
     run(original, commands(spec, 33, 34, random))
     restored = make(spec, 34)
     run(restored, commands(spec, 5, 34, random))
     restored.set_state(original.state())
-    np.testing.assert_array_equal(restored.joint_state(), original.joint_state())
+    np.testing.assert_array_equal(arrays(restored.robot_state()), arrays(original.robot_state()))
     velocity_commands = commands(spec, 300, 34, random)
     np.testing.assert_array_equal(run(restored, velocity_commands), run(original, velocity_commands))
     for key, value in restored.parameters().items():
@@ -172,20 +176,20 @@ def test_a_state_that_was_taken_does_not_change_with_what_happens_later(planar, 
     taken = physics.state()
     copy = {key: value.copy() for key, value in taken.items()}
     run(physics, commands(planar, 20, 4, random))
-    physics.reset(np.array([0, 2]), *start(planar, 2, random), wild(planar, 2, random))
+    physics.reset(np.array([0, 2]), RobotState(*start(planar, 2, random)), wild(planar, 2, random))
     for key, value in copy.items():
         np.testing.assert_array_equal(taken[key], value, err_msg=key)
 
 
 def test_returned_arrays_are_copies(planar, make):
     physics = make(planar, 2)
-    q, qd = physics.step(np.ones((2, 2)))
+    q, qd = arrays(physics.step(np.ones((2, 2))))
     expected = q.copy()
     q += 1
     qd += 1
-    physics.joint_state()[0][:] = 7
+    physics.robot_state().joint_position[:] = 7
     physics.parameters()["effort_limit"][:] = 0
-    np.testing.assert_array_equal(physics.joint_state()[0], expected)
+    np.testing.assert_array_equal(physics.robot_state().joint_position, expected)
     assert (physics.parameters()["effort_limit"] > 0).all()
 
 
@@ -199,7 +203,7 @@ def test_parameters_read_back_from_the_engine_are_those_that_were_set(spec, make
     q, qd = start(spec, 3, random)
     wanted = wild(spec, 3, random)
     wanted["joint_damping"] = random.uniform(0.1, 2.0, wanted["joint_damping"].shape)
-    physics.reset(rows, q, qd, wanted)
+    physics.reset(rows, RobotState(q, qd), wanted)
     run(physics, commands(spec, 5, 20, random))
     read = physics.parameters()
     for key, value in wanted.items():
@@ -236,7 +240,7 @@ def test_the_engine_itself_holds_the_masses_inertias_and_dampings(planar, make):
 
 def speeds(physics, parameters, steps, qd=0.0, command=1.0):
     """Joint velocities [steps, rows, n] of robots that hold one command from the same pose."""
-    shape = (physics.num_robots, len(physics.joint_state()[0][0]))
+    shape = (physics.num_robots, physics.robot_state().joint_position.shape[1])
     reset_all(physics, np.zeros(shape), np.full(shape, qd), parameters)
     return run(physics, np.full((steps, *shape), command))[:, 1]
 
@@ -280,7 +284,7 @@ def test_friction_helps_to_brake(planar, make, target):
     parameters["effort_limit"] = np.array([[100.0, 0.3]] * 2)  # a strong first joint holds still
     parameters["joint_friction"] = np.array([[0.0, 0.0], [0.0, 0.2]])
     reset_all(physics, np.zeros((2, 2)), np.tile([0.0, 2.0], (2, 1)), parameters)
-    frictionless, rubbing = physics.step(np.tile([0.0, target], (2, 1)))[1][:, 1]
+    frictionless, rubbing = physics.step(np.tile([0.0, target], (2, 1))).joint_velocity[:, 1]
     assert frictionless == pytest.approx(1.6, abs=0.1)
     assert rubbing == pytest.approx(2.0 - (2.0 - frictionless) * (0.3 + 0.2) / 0.3, abs=0.02)
 
@@ -362,13 +366,15 @@ def seen():
 before = seen()
 from physai.config import compose, validate
 from physai.envs.simulation import EnvConfig
+from physai.physics import RobotState
 from physai.physics.pybullet import PyBulletPhysics
 from physai.robots import RobotSpec
 spec = RobotSpec.from_config(validate(EnvConfig, compose("train", ["env=reacher"]).env).robot)
 physics = PyBulletPhysics(spec, 20, 0.02)
 for _ in range(10):
     physics.step(np.ones((20, 2)))
-physics.reset(np.arange(3), np.zeros((3, 2)), np.zeros((3, 2)), {k: v[:3] for k, v in physics.parameters().items()})
+parameters = {k: v[:3] for k, v in physics.parameters().items()}
+physics.reset(np.arange(3), RobotState(np.zeros((3, 2)), np.zeros((3, 2))), parameters)
 physics.set_state(physics.state())
 assert seen() == before
 physics.close()

@@ -4,7 +4,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from physai.robots import ForwardKinematics, RobotConfig, RobotSpec, TipPosition
+from physai.robots import EndEffector, ForwardKinematics, RobotConfig, RobotSpec
 from physai.robots.urdf import resolve
 
 SEVEN = [f"lbr_iiwa_joint_{number}" for number in range(1, 8)]
@@ -82,7 +82,8 @@ def test_a_joint_whose_urdf_names_no_axis_turns_about_x_as_pybullet_has_it(reach
 
 
 def test_all_seven_joints_of_the_kuka_match_pybullet(kuka_reacher):
-    config = RobotConfig.model_validate({**kuka_reacher.robot.model_dump(), "joints": SEVEN, "home": [0.0] * 7})
+    lists = {"joints": SEVEN, "home": [0.0] * 7, "command_limit": [0.5] * 7}
+    config = RobotConfig.model_validate({**kuka_reacher.robot.model_dump(), **lists})
     spec = RobotSpec.from_config(config)
     joint_position = random_positions(200, 7)
     found = ForwardKinematics(spec)(joint_position).numpy()
@@ -109,7 +110,16 @@ def test_any_chain_of_turned_joints_matches_pybullet(tmp_path, seed):
     path = tmp_path / "chain.urdf"
     path.write_text(f'<robot name="chain">{"".join(parts)}</robot>')
     # joint j4 is left out: it is held at zero, in the middle of the chain
-    config = RobotConfig(name="chain", urdf=str(path), joints=["j1", "j2", "j5"], end_effector="l7", home=[0.0] * 3)
+    config = RobotConfig(
+        name="chain",
+        urdf=str(path),
+        joints=["j1", "j2", "j5"],
+        end_effector="l7",
+        home=[0.0] * 3,
+        command="joint_velocity",
+        command_limit=[0.5] * 3,
+        position_gain=20.0,
+    )
     spec = RobotSpec.from_config(config)
     joint_position = random_positions(50, 3, seed)
     found = ForwardKinematics(spec)(joint_position).numpy()
@@ -162,28 +172,29 @@ def test_reach_bounds_the_distance_from_the_first_joint_and_is_attained_by_the_p
 
 def assert_same_in_numbers_and_arrays(spec):
     kinematics = ForwardKinematics(spec).double()
-    tip = TipPosition(ForwardKinematics(spec))
+    end_effector = EndEffector(ForwardKinematics(spec))
     joint_position = random_positions(200, len(spec.joints), seed=3).double()
-    expected = kinematics(joint_position)[:, :2].numpy()
+    expected = kinematics(joint_position).numpy()
     q = joint_position.numpy()
-    np.testing.assert_allclose(tip.of_many(q).T, expected, rtol=0, atol=1e-12)
-    np.testing.assert_allclose([tip.of_one(row) for row in q.tolist()], expected, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(end_effector(q), expected, rtol=0, atol=1e-12)
+    np.testing.assert_allclose([end_effector(row[None])[0] for row in q], expected, rtol=0, atol=1e-12)
 
 
-def test_the_tip_of_a_robot_is_to_the_last_bit_where_it_would_be_without_the_others(spec):
-    tip = TipPosition(ForwardKinematics(spec))
+def test_the_end_effector_of_a_robot_is_to_the_last_bit_where_it_would_be_in_a_smaller_batch(spec):
+    end_effector = EndEffector(ForwardKinematics(spec))
     q = random_positions(64, len(spec.joints)).double().numpy()
-    together = tip.of_many(q)
-    for rows in (1, 3, 7):
-        alone = [tip.of_many(q[first : first + rows]) for first in range(0, len(q), rows)]
-        np.testing.assert_array_equal(np.concatenate(alone, axis=1), together)
+    together = end_effector(q)
+    for rows in (2, 3, 7):
+        alone = [end_effector(q[first : first + rows]) for first in range(0, 63, rows)]
+        np.testing.assert_array_equal(np.concatenate(alone)[:60], together[:60])
 
 
-def test_the_tip_s_place_without_torch_is_that_of_the_module(spec):
+def test_the_end_effector_s_place_without_torch_is_that_of_the_module(spec):
     assert_same_in_numbers_and_arrays(spec)
 
 
 @pytest.mark.parametrize("joints", [1, 7])
-def test_the_tip_s_place_without_torch_is_that_of_the_module_for_any_number_of_joints(kuka_reacher, joints):
-    robot = {**kuka_reacher.robot.model_dump(), "joints": SEVEN[:joints], "home": [0.0] * joints}
+def test_the_end_effector_s_place_without_torch_is_that_of_the_module_for_any_number_of_joints(kuka_reacher, joints):
+    lists = {"home": [0.0] * joints, "command_limit": [0.5] * joints}
+    robot = {**kuka_reacher.robot.model_dump(), "joints": SEVEN[:joints], **lists}
     assert_same_in_numbers_and_arrays(RobotSpec.from_config(RobotConfig.model_validate(robot)))

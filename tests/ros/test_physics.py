@@ -15,9 +15,8 @@ from physai.errors import UserError
 from physai.physics import nominal_dynamics
 from physai.robots import RobotSpec
 from physai.ros import RosPhysics
-from physai.ros.commands import TOPIC
 from physai.ros.robot_link import RobotError
-from tests.ros.peer import wait_for
+from tests.ros.peer import TOPIC, wait_for
 
 DT = 0.02
 OPTIONS = {"homing_speed": 2.0, "state_timeout": 0.5, "reset_service": "/virtual_robot/reset", "remap": []}
@@ -108,7 +107,7 @@ def test_the_reset_service_puts_a_virtual_robot_home_at_once(start_robot, connec
     before = time.monotonic()
     home(physics)
     assert time.monotonic() - before < 1.0  # driving 2 rad at 2 rad/s would take longer
-    np.testing.assert_allclose(physics.joint_state()[0], 0.0, atol=0.02)
+    np.testing.assert_allclose(physics.robot_state().joint_position, 0.0, atol=0.02)
 
 
 def test_a_robot_without_the_service_is_driven_home_and_stands_there(start_robot, connect, peer):
@@ -117,7 +116,7 @@ def test_a_robot_without_the_service_is_driven_home_and_stands_there(start_robot
     move(physics, [2.0, -1.0], 40)
     since = time.monotonic()
     home(physics)
-    q, qd = physics.joint_state()
+    q, qd = arrays(physics.robot_state())
     assert np.abs(q).max() <= 0.02
     np.testing.assert_allclose(qd, 0.0, atol=0.01)
     sent = np.array([command for at, command in peer.commands if at > since + 0.1])
@@ -130,7 +129,7 @@ def test_a_continuous_joint_goes_the_shorter_way_around(start_robot, connect):
     physics = connect()
     physics.reset(ROW, np.array([[3.0, 0.0]]), REST)
     physics.reset(ROW, np.array([[-3.0, 0.0]]), REST)
-    assert physics.joint_state()[0][0, 0] == pytest.approx(2 * np.pi - 3.0, abs=0.021)
+    assert physics.robot_state().joint_position[0, 0] == pytest.approx(2 * np.pi - 3.0, abs=0.021)
 
 
 @pytest.mark.slow

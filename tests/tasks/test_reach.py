@@ -9,13 +9,27 @@ from scipy import stats
 
 from physai.envs.simulation import Simulation
 from physai.errors import UserError
-from physai.robots import ForwardKinematics, RobotSpec
-from physai.tasks import Reach
+from physai.physics import RobotState
+from physai.robots import EndEffector, ForwardKinematics, RobotSpec
+from physai.signals import Quantity
+from physai.tasks import Reach, Step
 
 
-@pytest.fixture
-def task():
-    return Reach([0.3, 0.53], tolerance=0.05, success_reward=10.0, max_steps=200, start_spread=[3.1, 2.5])
+@pytest.fixture(scope="module")
+def make_task(env_config):
+    """Make the task of an env's robot, with these arguments."""
+
+    def make(name="reacher", goal_radius=(0.3, 0.53)) -> Reach:
+        spec = RobotSpec.from_config(env_config(name).robot)
+        settings = {"tolerance": 0.05, "success_reward": 10.0, "max_steps": 200}
+        return Reach(spec, ForwardKinematics(spec), goal_radius=list(goal_radius), **settings)
+
+    return make
+
+
+@pytest.fixture(scope="module")
+def task(make_task):
+    return make_task()
 
 
 @pytest.fixture
@@ -34,19 +48,18 @@ def simulate(env_config):
 
 
 @pytest.fixture(scope="module")
-def turning(reacher):
+def turning(task):
     """What an arm whose first joint is continuous, and whose second is not, observes."""
-    spec = RobotSpec.from_config(reacher.robot)
-    return Reach([0.3, 0.53], 0.05, 10.0, 200, [3.1, 2.5]).observation(spec, ForwardKinematics(spec))
+    return task.module
 
 
 def put_goal_at_the_tip(simulation, row):
     simulation.goal = simulation.goal.copy()
-    simulation.goal[row] = simulation.end_effector[row]
+    simulation.goal[row] = EndEffector(simulation.kinematics)(simulation.state.joint_position)[row, :2]
 
 
 def test_goals_lie_in_the_ring_at_a_uniform_angle_and_radius(task):
-    goals = task.sample_goal(5000, torch.Generator().manual_seed(0)).astype(float)
+    goals = task.region.sample(5000, torch.Generator().manual_seed(0)).astype(float)
     radius = np.linalg.norm(goals, axis=1)
     angle = np.arctan2(goals[:, 1], goals[:, 0]) % (2 * np.pi)
     assert radius.min() >= 0.3 - 1e-6
@@ -58,62 +71,66 @@ def test_goals_lie_in_the_ring_at_a_uniform_angle_and_radius(task):
 
 def test_the_kuka_s_goals_lie_between_30_and_60_cm(simulate):
     simulation = simulate(name="kuka_reacher", robots=1)
-    radius = np.linalg.norm(simulation.task.sample_goal(1000, torch.Generator().manual_seed(0)), axis=1)
+    radius = np.linalg.norm(simulation.task.region.sample(1000, torch.Generator().manual_seed(0)), axis=1)
     assert 0.3 - 1e-6 <= radius.min() < 0.31
     assert 0.59 < radius.max() <= 0.6 + 1e-6
 
 
-def test_goals_and_starts_follow_the_generator(task, reacher):
-    spec = RobotSpec.from_config(reacher.robot)
-    for sample in (task.sample_goal, lambda rows, generator: task.sample_start(rows, spec, generator)):
-        first, again, other = (sample(16, torch.Generator().manual_seed(seed)) for seed in (1, 1, 2))
-        np.testing.assert_array_equal(first, again)
-        assert not np.isclose(first, other).any()
+def test_goals_and_starts_follow_the_generator(task, simulate):
+    first, again, other = (task.region.sample(16, torch.Generator().manual_seed(seed)) for seed in (1, 1, 2))
+    np.testing.assert_array_equal(first, again)
+    assert not np.isclose(first, other).any()
+    simulation, starts = simulate(), []
+    for seed in (1, 1, 2):
+        simulation.seed(seed)
+        simulation.reset()
+        starts.append(simulation.state.joint_position)
+    np.testing.assert_array_equal(starts[0], starts[1])
+    assert not np.isclose(starts[0], starts[2]).any()
 
 
-def test_starts_are_uniform_around_home_and_stay_within_the_joint_limits(any_env):
-    spec = RobotSpec.from_config(any_env.robot)
-    spread = any_env.task["start_spread"]
-    task = Reach([0.3, 0.5], 0.05, 10.0, 200, spread)
-    starts = task.sample_start(4000, spec, torch.Generator().manual_seed(0))
-    for joint, width in enumerate(spread):
-        expected = stats.uniform(spec.home[joint] - width, 2 * width)
-        assert stats.kstest(starts[:, joint], expected.cdf).pvalue > 0.01
-    wide = Reach([0.3, 0.5], 0.05, 10.0, 200, [100.0, 100.0])
-    starts = wide.sample_start(100, spec, torch.Generator().manual_seed(0))
+def test_starts_are_uniform_around_home_and_stay_within_the_joint_limits(any_env, simulate):
+    simulation = simulate(name=any_env.name, robots=1000)
+    for joint, width in enumerate(any_env.start.spread):
+        expected = stats.uniform(simulation.spec.home[joint] - width, 2 * width)
+        assert stats.kstest(simulation.state.joint_position[:, joint], expected.cdf).pvalue > 0.01
+    spec, starts = simulation.spec, simulate("env.start.spread=[100,100]", name=any_env.name).state.joint_position
     assert (starts >= spec.position_limit[:, 0]).all()
     assert (starts <= spec.position_limit[:, 1]).all()
 
 
-def test_distance_counts_in_the_plane_only(task, kuka_reacher):
-    spec = RobotSpec.from_config(kuka_reacher.robot)
-    kinematics = ForwardKinematics(spec)
+def test_distance_counts_in_the_plane_only(make_task, kuka_reacher):
+    task, kinematics = make_task("kuka_reacher"), ForwardKinematics(RobotSpec.from_config(kuka_reacher.robot))
     q = torch.tensor([[0.0, 0.5], [1.0, -0.8]])
     end_effector = kinematics(q)
     assert (end_effector[:, 2] > 0.5).all()
     goal = end_effector[:, :2] + torch.tensor([[0.3, 0.4], [-0.6, 0.8]])
-    torch.testing.assert_close(task.observation(spec, kinematics).distance(q, goal), torch.tensor([[0.5], [1.0]]))
+    torch.testing.assert_close(task.module.error(q, goal), torch.tensor([[0.5], [1.0]]))
+    state = RobotState(q.double().numpy(), np.zeros((2, 2)))
+    np.testing.assert_allclose(task.error(state, goal.double().numpy()), [[0.5], [1.0]], rtol=1e-6)
 
 
 def test_reward_and_success_are_the_numbers_of_the_contract(task):
-    distance = np.array([[0.0], [0.03], [0.0499], [0.05], [0.2], [1.08]])
-    success = task.success(distance)
-    assert success[:, 0].tolist() == [True, True, True, False, False, False]
-    expected = [[10.0], [9.97], [9.9501], [-0.05], [-0.2], [-1.08]]
-    np.testing.assert_allclose(task.reward(distance, success), expected)
-    numbers = [[task.reward(d, task.success(d))] for d in distance[:, 0].tolist()]
-    np.testing.assert_array_equal(task.reward(distance, success), numbers)
+    error = np.array([[0.0], [0.03], [0.0499], [0.05], [0.2], [1.08]])
+    still = np.zeros((6, 2))
+    step = Step(RobotState(still, still), still, still, error, 0.02 * (error[:, 0] < task.tolerances[0].value))
+    success = task.success(step)
+    assert success.tolist() == [True, True, True, False, False, False]
+    assert task.terminated(step, success).tolist() == success.tolist()
+    rewards = task.rewards(step, success)
+    assert list(rewards) == ["distance", "success"]
+    np.testing.assert_allclose(sum(rewards.values()), [10.0, 9.97, 9.9501, -0.05, -0.2, -1.08])
+
+
+def test_its_goal_is_a_place_in_the_frame_of_the_robot_s_base(task, reacher):
+    assert (task.goal.quantity, task.goal.labels, task.goal.unit) == (Quantity.POSITION, ("x", "y"), "m")
+    assert task.goal.frame == RobotSpec.from_config(reacher.robot).base
 
 
 @pytest.fixture
-def observe(task, env_config):
+def observe(make_task):
     """Make the observation module of an env's robot."""
-
-    def make(name="reacher"):
-        spec = RobotSpec.from_config(env_config(name).robot)
-        return task.observation(spec, ForwardKinematics(spec))
-
-    return make
+    return lambda name="reacher": make_task(name).module
 
 
 def test_the_observation_is_positions_velocities_tip_and_goal(observe):
@@ -144,14 +161,12 @@ def test_positions_of_joints_with_limits_are_observed_as_they_are(observe):
 
 def test_observations_have_finite_bounds_that_hold_after_many_turns(task, reacher):
     spec = RobotSpec.from_config(reacher.robot)
-    kinematics = ForwardKinematics(spec)
-    lower, upper = task.observation_bounds(spec, kinematics)
-    assert torch.isfinite(lower).all()
-    assert torch.isfinite(upper).all()
+    lower, upper = task.observation.bounds
+    assert np.isfinite(lower).all()
+    assert np.isfinite(upper).all()
     q = torch.stack([torch.linspace(-1000, 1000, 5000), torch.linspace(-2.6, 2.6, 5000)], dim=1)
-    observation, _ = task.observation(spec, kinematics)(
-        q, torch.zeros_like(q), torch.from_numpy(task.sample_goal(5000, torch.Generator()))
-    )
+    goal = torch.from_numpy(task.region.sample(5000, torch.Generator())).float()
+    observation = task.module(q, torch.zeros_like(q), goal)[0].numpy()
     assert ((lower <= observation) & (observation <= upper)).all()
     assert spec.position_limit[0].tolist() == [-math.inf, math.inf]  # what it says of the robot is left alone
 
@@ -168,7 +183,7 @@ def test_the_scripted_observation_equals_eager_bit_for_bit(any_env, observe):
 
 def test_the_step_that_reaches_the_goal_and_runs_out_of_time_only_terminates(simulate):
     simulation = simulate("env.task.max_steps=1")
-    simulation.goal = np.full((4, 2), 9.0, np.float32)
+    simulation.goal = np.full((4, 2), 9.0)
     put_goal_at_the_tip(simulation, 2)
     reward, terminated, truncated = simulation.step(np.zeros((4, 2)))
     assert terminated[:, 0].tolist() == [False, False, True, False]
@@ -179,7 +194,7 @@ def test_the_step_that_reaches_the_goal_and_runs_out_of_time_only_terminates(sim
 
 def test_episodes_that_miss_the_goal_are_truncated_after_exactly_200_steps(simulate):
     simulation = simulate()
-    simulation.goal = np.full((4, 2), 9.0, np.float32)
+    simulation.goal = np.full((4, 2), 9.0)
     late = np.array([False, True, False, False])
     for step in range(1, 241):
         _, terminated, truncated = simulation.step(np.zeros((4, 2)))
@@ -188,7 +203,7 @@ def test_episodes_that_miss_the_goal_are_truncated_after_exactly_200_steps(simul
         assert truncated[:, 0].tolist() == expected
         if step == 40:
             simulation.reset(late)
-            simulation.goal = np.full((4, 2), 9.0, np.float32)
+            simulation.goal = np.full((4, 2), 9.0)
     assert simulation.episode_length[:, 0].tolist() == [240, 200, 240, 240]
 
 
@@ -200,31 +215,30 @@ def test_return_and_length_sum_up_since_the_row_s_own_reset(simulate):
         if step == 5:
             simulation.reset(np.array([True, False, False, False]))
     sums = np.stack([sum(rewards[6:])[0], *sum(rewards)[1:]])
-    np.testing.assert_allclose(simulation.episode_return, sums, rtol=1e-5)
+    np.testing.assert_allclose(simulation.episode_rewards.sum(axis=1, keepdims=True), sums, rtol=1e-5)
     assert simulation.episode_length[:, 0].tolist() == [4, 10, 10, 10]
 
 
 def test_an_action_is_a_share_of_the_greatest_velocity_and_is_clamped(simulate):
-    simulation = simulate("env.task.start_spread=[0,0]")
+    simulation = simulate("env.start.spread=[0,0]")
     action = np.array([[0.5, 0.0], [1.0, 0.0], [3.0, 0.0], [-7.0, 0.0]])
     for _ in range(30):
         simulation.step(action)
-    np.testing.assert_allclose(simulation.joint_velocity[:, 0], [1.0, 2.0, 2.0, -2.0], rtol=0, atol=0.02)
+    np.testing.assert_allclose(simulation.state.joint_velocity[:, 0], [1.0, 2.0, 2.0, -2.0], rtol=0, atol=0.02)
 
 
 def put(simulation, joint_position, joint_velocity, goal):
     """Bring all robots into a state; numbers that a float32 can hold, for that is what a policy gets."""
-    simulation.goal = np.array(goal, np.float32)
-    rows = np.arange(simulation.num_envs)
-    simulation.physics.reset(
-        rows, *(np.array(value, np.float32).astype(float) for value in (joint_position, joint_velocity))
+    position, velocity, simulation.goal = (
+        np.array(value, np.float32).astype(float) for value in (joint_position, joint_velocity, goal)
     )
-    simulation.set_state(simulation.state())
+    simulation.physics.reset(np.arange(simulation.num_envs), RobotState(position, velocity))
+    simulation.restore(simulation.snapshot())
 
 
 def what_a_policy_sees(simulation):
-    state = simulation.joint_position, simulation.joint_velocity, simulation.goal
-    return simulation.observation(*(torch.from_numpy(value) for value in state))[0].numpy()
+    state = simulation.state.joint_position, simulation.state.joint_velocity, simulation.goal
+    return simulation.task.module(*(torch.from_numpy(value).float() for value in state))[0].numpy()
 
 
 def assert_same_observation(found, expected, continuous):
@@ -255,41 +269,8 @@ def test_what_a_simulation_observes_is_what_a_policy_sees(both, joint_position, 
         found = simulation.observe()
         assert found.dtype == np.float32
         assert_same_observation(found, what_a_policy_sees(simulation), simulation.spec.continuous)
-        distance = simulation.observation.distance(*map(torch.from_numpy, (simulation.joint_position, simulation.goal)))
-        np.testing.assert_allclose(simulation.distance, distance.numpy(), rtol=0, atol=1e-6)
-
-
-@pytest.mark.parametrize("name", ["reacher", "kuka_reacher"])
-def test_one_robot_in_numbers_does_what_it_does_in_arrays(simulate, name):
-    numbers, arrays = (simulate("env.task.max_steps=40", name=name, robots=1) for _ in range(2))
-    random = np.random.default_rng(0)
-    shares = np.repeat(random.uniform(-2, 2, (20, 2)), 10, axis=0).astype(np.float32)
-    shares[0] = [0.0, np.float32(1.0)]
-    ends = set()
-    for step, action in enumerate(shares):
-        if step == 30:
-            for simulation in (numbers, arrays):
-                put_goal_at_the_tip(simulation, 0)
-        observation, reward, terminated, truncated, info = numbers.step_one(action)
-        rewards, terminations, truncations = arrays.step(action[None])
-        for key, value in arrays.physics.state().items():
-            np.testing.assert_array_equal(numbers.physics.state()[key], value)
-        for key in ("joint_position", "joint_velocity", "episode_length"):
-            np.testing.assert_array_equal(getattr(numbers, key), getattr(arrays, key))
-        for key in ("end_effector", "distance", "episode_return"):
-            found, expected = getattr(numbers, key), getattr(arrays, key)
-            assert found.dtype == expected.dtype
-            np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-6)
-        assert_same_observation(observation, arrays.observe()[0], arrays.spec.continuous)
-        assert reward == pytest.approx(rewards.item(), abs=1e-6)
-        assert (terminated, truncated) == (terminations.item(), truncations.item())
-        assert info == {"is_success": terminated, "distance": pytest.approx(arrays.distance.item(), abs=1e-6)}
-        assert all(type(value) is bool for value in (terminated, truncated, info["is_success"]))
-        ends.add((terminated, truncated))
-        if terminated or truncated:
-            numbers.reset()
-            arrays.reset()
-    assert ends == {(False, False), (True, False), (False, True)}
+        where = (torch.from_numpy(value).float() for value in (simulation.state.joint_position, simulation.goal))
+        np.testing.assert_allclose(simulation.error, simulation.task.module.error(*where).numpy(), rtol=0, atol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -297,8 +278,8 @@ def test_one_robot_in_numbers_does_what_it_does_in_arrays(simulate, name):
     [
         ("env.task.goal_radius=[0.5,0.3]", ["env.task.goal_radius", "0.5", "0.3"]),
         ("env.task.goal_radius=[0.3,0.9]", ["env.task.goal_radius", "0.9", "reach", "planar_arm"]),
-        ("env.task.start_spread=[1.0]", ["env.task.start_spread", "2 joints"]),
-        ("env.max_velocity=3.0", ["env.max_velocity", "3.0", "2.5"]),
+        ("env.start.spread=[1.0]", ["env.start.spread", "2 joints"]),
+        ("env.robot.command_limit=[1.0,3.0]", ["command_limit", "joint2", "3 rad/s", "2.5"]),
     ],
 )
 def test_a_task_that_the_robot_cannot_do_is_refused(env_config, override, words):

@@ -107,11 +107,14 @@ def test_delays_are_whole_steps_up_to_the_longest(layout):
     steps, counts = np.unique(values, return_counts=True)
     assert steps.tolist() == [0, 1, 2, 3]
     assert stats.chisquare(counts, np.array([1, 2, 2, 1]) / 6 * len(values)).pvalue > 1e-3
-    assert config(actuator_delay=uniform(0.0, 3.0)).max_delay == 3
-    normal_delay = config(actuator_delay=normal(1.0, 0.5))
     values, _ = draw(layout, rows=20000, actuator_delay=normal(1.0, 0.5))
-    assert values.min() >= 0
-    assert values.max() <= normal_delay.max_delay
+    assert values.min() == 0
+
+
+def test_a_scale_of_what_is_zero_is_found_to_have_no_effect(layout):
+    scaled = config(payload={**uniform(0.5, 2.0), "operation": "scale"}, effort_limit=uniform(0.5, 1.0))
+    assert scaled.without_effect(layout) == ["payload"]
+    assert config(payload=uniform(0.0, 1.0)).without_effect(layout) == []
 
 
 def test_what_must_not_be_negative_is_not(layout):

@@ -1,0 +1,47 @@
+"""Looking at simulated robots; nothing of a viewer is imported before somebody looks."""
+
+import os
+import sys
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+
+from physai.envs.simulation import Simulation
+from physai.signals import Quantity
+
+if TYPE_CHECKING:
+    from physai.physics.viewer import Viewer
+
+_SIZE = 0.03  # m; of the marker of a goal whose tolerance is no length
+
+
+def has_screen() -> bool:
+    """Whether a window can be opened here."""
+    return not sys.platform.startswith("linux") or bool(os.environ.get("DISPLAY"))
+
+
+def make_viewer(simulation: Simulation, window: bool = False) -> "Viewer":
+    """Make a viewer for these robots; it has a world of its own.
+
+    Raises:
+        UserError: If a window is asked for where there is no screen.
+    """
+    from physai.errors import UserError
+    from physai.physics.viewer import Viewer
+
+    if window and not has_screen():
+        raise UserError("there is no screen here (DISPLAY is not set): render images instead of a window")
+    home = torch.from_numpy(simulation.spec.home).float()
+    height = float(simulation.kinematics(home[None])[0, 2])
+    tolerance = simulation.task.tolerances[0]
+    size = tolerance.value if tolerance.unit == "m" else _SIZE
+    return Viewer(simulation.spec, height, simulation.kinematics.reach, size, window)
+
+
+def show(viewer: "Viewer", simulation: Simulation, row: int = 0) -> np.ndarray | None:
+    """Show a robot and its goal; return an image [height, width, 3] uint8, or None with a window."""
+    goal = simulation.goal[row]
+    if simulation.task.goal.quantity is Quantity.JOINT_POSITION:  # where the end effector would be
+        goal = simulation.kinematics(torch.from_numpy(goal[None]).float())[0].numpy()
+    return viewer.show(simulation.state.joint_position[row], goal)

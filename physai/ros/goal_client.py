@@ -1,0 +1,187 @@
+"""Sending an arm from goal to goal over ROS 2, and seeing what it does."""
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from types import TracebackType
+
+import numpy as np
+import rclpy
+from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.signals import SignalHandlerOptions
+from sensor_msgs.msg import JointState
+from std_msgs.msg import String
+
+from physai.deploy import Policy, State
+from physai.errors import UserError
+from physai.ros import goals, qos
+from physai.ros.commands import topic
+from physai.ros.processes import NodeProcess
+from physai.ros.run import prepare_middleware
+from physai.signals import Tolerance
+
+_LOOK = 1.0  # s for others to be discovered
+_START = 30.0  # s until both nodes work
+_PER_GOAL = 60.0  # s
+_SETTLE = 0.1  # s that a goal may take to the node
+
+
+@dataclass
+class GoalResult:
+    """One goal.
+
+    Attributes:
+        goal: Its numbers, in the order of the policy's goal signal.
+        unit: Of these numbers.
+        tolerances: Errors that count as reached, one for each error of the policy.
+        sent: When it was sent, s.
+        reached: When it was reached, s; None if it never was.
+        error: Largest errors while it was held.
+    """
+
+    goal: np.ndarray
+    unit: str
+    tolerances: tuple[Tolerance, ...]
+    sent: float
+    reached: float | None = None
+    error: np.ndarray | None = None
+
+    def within(self, error: np.ndarray | None) -> bool:
+        """Whether errors are all within the tolerances."""
+        limits = [tolerance.value for tolerance in self.tolerances]
+        return error is not None and bool((error < limits).all())
+
+    @property
+    def kept(self) -> bool:
+        """Whether it was reached, and the robot stayed within the tolerances."""
+        return self.reached is not None and self.within(self.error)
+
+    def describe(self) -> str:
+        """One line."""
+        where = f"({', '.join(f'{number:+.2f}' for number in self.goal)}) {self.unit}"
+        if self.reached is None or self.error is None:
+            return f"{where}  not reached"
+        worst = int(np.argmax(self.error / [tolerance.value for tolerance in self.tolerances]))
+        return (
+            f"{where}  reached in {self.reached - self.sent:4.1f} s, {'held' if self.kept else 'LEFT'}, "
+            f"{self.tolerances[worst].name} at most {self.error[worst]:.3f} {self.tolerances[worst].unit}"
+        )
+
+
+@dataclass
+class Record:
+    """What happened.
+
+    Attributes:
+        results: Goals in order.
+        times: Of the joint states, s.
+        positions: Joint positions [n], rad.
+    """
+
+    results: list[GoalResult] = field(default_factory=list)
+    times: list[float] = field(default_factory=list)
+    positions: list[np.ndarray] = field(default_factory=list)
+
+
+class GoalClient:
+    """The node that sends goals and watches joint states and the inference node's state, in a context of its own.
+
+    Args:
+        policy: Tells how far the robot is from a goal.
+
+    Attributes:
+        record: What happened so far.
+        watch: Processes that must not end meanwhile.
+    """
+
+    def __init__(self, policy: Policy) -> None:
+        self.record = Record()
+        self.watch: Sequence[NodeProcess] = ()
+        self._policy = policy
+        self._metadata = policy.metadata
+        self._state = ""
+        prepare_middleware()
+        self._context = Context()
+        rclpy.init(context=self._context, signal_handler_options=SignalHandlerOptions.NO)
+        self._node = rclpy.create_node("goal_client", context=self._context)
+        self._executor = SingleThreadedExecutor(context=self._context)
+        self._executor.add_node(self._node)
+        self._goals = self._node.create_publisher(goals.goal_type(policy.metadata.goal), "/inference_node/goal", 1)
+        self._node.create_subscription(JointState, "/joint_states", self._take_joint_state, qos.SENSOR)
+        self._node.create_subscription(String, "/inference_node/state", self._take_state, qos.LATCHED)
+
+    def check_alone(self) -> None:
+        """See that there is no other robot whose controller would obey.
+
+        Raises:
+            UserError: If there is.
+        """
+        end = time.monotonic() + _LOOK
+        while time.monotonic() < end:
+            self._executor.spin_once(0.05)
+            commands = topic(self._metadata.command.quantity)
+            for name, others in (
+                (commands, self._node.count_subscribers(commands) + self._node.count_publishers(commands)),
+                ("/joint_states", self._node.count_publishers("/joint_states")),
+            ):
+                if others:
+                    raise UserError(f"another node uses {name} here: choose another ROS_DOMAIN_ID")
+
+    def wait_until_ready(self) -> None:
+        """Wait for joint states, and for a node that waits for a goal.
+
+        Raises:
+            UserError: If they do not come.
+        """
+        ready = (State.WAITING.value, State.REACHED.value)
+        self._spin(
+            lambda: bool(self.record.times) and self._state in ready and self._goals.get_subscription_count(), _START
+        )
+        if not self.record.times or self._state not in ready:
+            raise UserError(f"the nodes do not work: joint states: {bool(self.record.times)}, state: '{self._state}'")
+
+    def send(self, goal: np.ndarray, hold: float) -> GoalResult:
+        """Send a goal [g], wait until it is reached, and watch the robot for a while, s."""
+        signal = self._metadata.goal
+        result = GoalResult(goal, signal.unit, self._metadata.tolerances, time.monotonic())
+        self.record.results.append(result)
+        self._goals.publish(goals.to_message(goal.tolist(), signal, self._node.get_clock().now().to_msg()))
+        self._spin(lambda: False, _SETTLE)
+        if self._spin(lambda: self._state == State.REACHED.value and result.within(self._error(-1, goal)), _PER_GOAL):
+            result.reached = time.monotonic()
+            seen = len(self.record.positions)
+            self._spin(lambda: False, hold)
+            held = range(seen, len(self.record.positions))
+            result.error = np.max([self._error(index, goal) for index in held], axis=0) if held else None
+        return result
+
+    def _error(self, index: int, goal: np.ndarray) -> np.ndarray:
+        return self._policy.error(self.record.positions[index], goal)
+
+    def _spin(self, done: Callable[[], object], seconds: float) -> bool:
+        end = time.monotonic() + seconds
+        while time.monotonic() < end:
+            self._executor.spin_once(0.05)
+            if done():
+                return True
+            for process in self.watch:
+                if process.ended:
+                    raise UserError(f"{process.module} has ended: {process.last_words()}")
+        return False
+
+    def _take_joint_state(self, message: JointState) -> None:
+        index = [message.name.index(joint) for joint in self._metadata.joints]
+        self.record.times.append(time.monotonic())
+        self.record.positions.append(np.array(message.position)[index])
+
+    def _take_state(self, message: String) -> None:
+        self._state = message.data
+
+    def __enter__(self) -> "GoalClient":
+        return self
+
+    def __exit__(self, kind: type | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self._executor.shutdown()
+        self._node.destroy_node()
+        self._context.try_shutdown()

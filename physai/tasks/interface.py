@@ -1,0 +1,92 @@
+"""What a task is: a goal, what a policy sees of it, and how a step is judged."""
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from physai.physics import RobotState
+from physai.signals import Region, Signal, Tolerance
+
+
+class ObservationModule(nn.Module):
+    """From what a robot senses to what its policy sees; scriptable, and part of the exported policy."""
+
+    def forward(self, joint_position: Tensor, joint_velocity: Tensor, goal: Tensor) -> tuple[Tensor, Tensor]:
+        """Map positions [N, n] rad, velocities [N, n] rad/s and goals [N, g] to observation and features.
+
+        Returns:
+            Observation [N, o], which is normalized, and features [N, f], which a policy sees as they are.
+        """
+        raise NotImplementedError
+
+    @torch.jit.export
+    def error(self, joint_position: Tensor, goal: Tensor) -> Tensor:
+        """Map positions [N, n] rad and goals [N, g] to how far they are apart, one column a tolerance, [N, e]."""
+        raise NotImplementedError
+
+
+@dataclass(frozen=True)
+class Step:
+    """Where one control step has led N robots.
+
+    Attributes:
+        state: What the robots do now.
+        command: What they were told, rad/s or rad, [N, n].
+        goal: [N, g].
+        error: How far they are from it, one column a tolerance, [N, e].
+        held: For how long all errors have been within their tolerances without a break, s, [N].
+    """
+
+    state: RobotState
+    command: np.ndarray
+    goal: np.ndarray
+    error: np.ndarray
+    held: np.ndarray
+
+
+class Task(Protocol):
+    """What N robots shall do; made from a robot, its kinematics, and what its YAML says.
+
+    A task judges, and keeps nothing between two steps. Inherit from it: the methods with a body are taken as they are,
+    or written again where that is faster.
+
+    Attributes:
+        goal: What is asked of the robot; its name is ``goal``.
+        region: Where goals lie.
+        tolerances: One for each column of the errors.
+        observation: What the observation module makes, with bounds.
+        module: The observation module.
+        max_steps: Control steps until an episode is truncated.
+    """
+
+    goal: Signal
+    region: Region
+    tolerances: tuple[Tolerance, ...]
+    observation: Signal
+    module: ObservationModule
+    max_steps: int
+
+    def success(self, step: Step) -> np.ndarray:
+        """Whether the robots do what they shall, [N]; an episode is a success if its last step is one."""
+
+    def terminated(self, step: Step, success: np.ndarray) -> np.ndarray:
+        """Whether their episodes are over, [N], for a reason other than time."""
+
+    def rewards(self, step: Step, success: np.ndarray) -> dict[str, np.ndarray]:
+        """Return the terms of the reward by name, [N] each; the reward is their sum."""
+
+    @torch.no_grad()
+    def error(self, state: RobotState, goal: np.ndarray) -> np.ndarray:
+        """Return how far the robots are from their goals [N, g], one column a tolerance, [N, e]."""
+        arrays = state.joint_position, goal
+        return self.module.error(*(torch.from_numpy(array).float() for array in arrays)).numpy()
+
+    @torch.no_grad()
+    def observe(self, state: RobotState, goal: np.ndarray) -> np.ndarray:
+        """Return the observation of the true state, [N, o], as the module makes it."""
+        arrays = state.joint_position, state.joint_velocity, goal
+        observation, _ = self.module(*(torch.from_numpy(array).float() for array in arrays))
+        return observation.numpy()
