@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from physai.deploy import Controller, ControllerConfig, Goal, JointState, State
 from physai.errors import UserError
-from tests.deploy.conftest import ALL_FAILURES, Troubled
+from tests.deploy.troubled import ALL_FAILURES, Troubled
 from tests.deploy.world import NAMES, PERIOD, Analytic, World
 
 # What can happen: each function makes one tick of it. ``tick`` counts from zero while it lasts.

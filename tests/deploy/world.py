@@ -8,7 +8,7 @@ import numpy as np
 
 from physai.deploy import Controller, JointState, State
 from physai.signals import Quantity
-from tests.deploy.conftest import Troubled
+from tests.deploy.troubled import Troubled
 
 PERIOD = 0.02
 NAMES = ("joint1", "joint2")
@@ -277,7 +277,7 @@ class World:
             expected = None
         if expected:
             stop = True
-            assert policy.measured is None
+            assert policy.error_told is None
             assert not policy.called
         else:
             expected, stop = self._drive(stop, elapsed)
@@ -529,19 +529,19 @@ class World:
         """Return the state, and whether the arm stands in this tick."""
         policy, standing = self.policy, State.REACHED if self.reached else State.ACTIVE
         if stop:
-            assert policy.measured is None
+            assert policy.error_told is None
             assert not policy.called
             return standing, True
         assert math.dist(policy.goal.tolist(), self.goal) < 1e-9
-        if policy.measured is not None:
+        if policy.error_told is not None:
             hysteresis = self.config.reached_hysteresis if self.reached else 1.0
-            self.reached = policy.measured < self.tolerance * hysteresis
+            self.reached = policy.error_told < self.tolerance * hysteresis
             if self.reached:
                 self.nearest, self.waited = math.inf, 0.0
                 assert not policy.called
                 return State.REACHED, True
-            if policy.measured < self.nearest - 0.1 * self.tolerance:
-                self.nearest, self.waited = policy.measured, 0.0
+            if policy.error_told < self.nearest - 0.1 * self.tolerance:
+                self.nearest, self.waited = policy.error_told, 0.0
             else:
                 self.waited += elapsed
             if self.waited > self.config.progress_timeout:
