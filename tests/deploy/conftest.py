@@ -6,7 +6,7 @@ import pytest
 
 from physai.deploy import Policy, load_policy
 
-for helper in ("files", "robot", "world"):
+for helper in ("files", "hearing", "robot", "targets", "world"):
     pytest.register_assert_rewrite(f"tests.deploy.{helper}")
 
 
