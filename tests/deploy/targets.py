@@ -32,12 +32,14 @@ class Targets:
         return self._as_counted(position) if self.drove else position
 
     def stood(self, target, position, lead):
-        """See the target of an arm that stands: where it was found, unless it was moved far away since."""
+        """See the target of an arm that stands; return whether it is a new one, since the arm was moved far away."""
+        elsewhere = False
         expected = None if self.drove or self.target is None else self._as_counted(position)
         if expected is None or max(abs(one - q) for one, q in zip(expected, position, strict=True)) > lead:
-            expected = position
+            elsewhere, expected = expected is not None, position
         assert max(abs(one - other) for one, other in zip(target, expected, strict=True)) < _EDGE, (target, expected)
         self.target, self.way, self.held, self.drove = target, STILL, set(), False
+        return elsewhere
 
     def moved(self, target, position, lead):
         """See the target of an arm that is driven."""

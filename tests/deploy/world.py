@@ -202,7 +202,7 @@ class World(Hearing):
         """See that positions are where they may be; return the velocities that they stand for."""
         targets, lead = self.targets, self.config.max_lead
         if stop:
-            targets.stood(target, self.accepted, lead)
+            self.seen["stood elsewhere"] += targets.stood(target, self.accepted, lead)
             return STILL
         targets.moved(target, self.accepted, lead)
         self.seen["held near the arm"] += len(targets.held)
