@@ -19,6 +19,7 @@ def random_config(rng):
         following_error=0.3 if usual else rng.choice((0.1, 0.3, 1.0)),
         progress_timeout=rng.choice((1.0, 2.0, 10.0)),
         effort_time=rng.choice((0.1, 0.5)),
+        max_lead=0.25 if usual else rng.choice((0.01, 0.05, 0.25)),
     )
 
 
@@ -39,5 +40,4 @@ def other_config(rng):
         velocity_error=rng.choice((0.1, 0.25, 1.0)),
         progress_timeout=rng.choice((0.5, 1.5, 10.0)),
         effort_time=rng.choice((0.0, 0.04, 0.5)),
-        max_lead=rng.choice((0.01, 0.05, 0.25)),
     )
