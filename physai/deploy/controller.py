@@ -54,7 +54,7 @@ class Controller:
         self._asked = CheckedPolicy(policy, stopwatch)
         self._interface = INTERFACES[metadata.command.quantity](metadata)
         self._period = 1.0 / metadata.control_rate
-        self._tolerance = np.array([tolerance.value for tolerance in metadata.tolerances])
+        self._tolerances = [tolerance.value for tolerance in metadata.tolerances]
         self._counters: Counter[str] = Counter()
         self._latched: State | None = None
         self._latch_reason = ""
@@ -231,7 +231,7 @@ class Controller:
         if projected:
             self._counters["goals projected"] += 1
             reasons.append(f"goal out of reach: {new.tolist()} is the nearest in reach")
-        if self._goal is None or np.abs(new - self._goal).max() > _MOVED * self._tolerance[0]:
+        if self._goal is None or np.abs(new - self._goal).max() > _MOVED * self._tolerances[0]:
             self._reached, self._gave_up = False, ""
             self._progress.restart()
             self._memory = self._asked.nothing
@@ -327,7 +327,7 @@ class Controller:
         robot, config = self._robot, self.config
         try:
             error = self._asked.error(robot.turned, self._goal)
-            far = float((error / self._tolerance).max())
+            far = max(each / tolerance for each, tolerance in zip(error, self._tolerances, strict=True))
             self._reached = far < (config.reached_hysteresis if self._reached else 1.0)
             if self._reached:
                 self._progress.restart()
@@ -366,7 +366,7 @@ class Controller:
             reasons.append(waits)
         return value
 
-    def _give_up(self, error: np.ndarray, reasons: list[str]) -> tuple[None, np.ndarray]:
+    def _give_up(self, error: list[float], reasons: list[str]) -> tuple[None, np.ndarray]:
         self._counters["holds: no progress"] += 1
         tolerances = self.policy.metadata.tolerances
         far = ", ".join(f"{each:.3f} {tolerance.unit}" for each, tolerance in zip(error, tolerances, strict=True))

@@ -64,8 +64,10 @@ class VelocityLimits:
         if largest > fastest:
             velocity = velocity * (fastest / largest)
         # Outward motion at a limit stops at once, what is wanted as what still goes on.
-        highest = np.where(np.maximum(position, target) >= self._inner_upper, 0.0, np.inf)
-        lowest = np.where(np.minimum(position, target) <= self._inner_lower, 0.0, -np.inf)
+        told = target is not position
+        most, least = (np.maximum(position, target), np.minimum(position, target)) if told else (position, position)
+        highest = np.where(most >= self._inner_upper, 0.0, np.inf)
+        lowest = np.where(least <= self._inner_lower, 0.0, -np.inf)
         inward = np.minimum(np.maximum(velocity, lowest), highest)
         going, last = last, np.minimum(np.maximum(last, lowest), highest)
         if reason is None and ((inward != velocity) | (going != last)).any():
