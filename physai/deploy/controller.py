@@ -8,24 +8,20 @@ from typing import Any
 
 import numpy as np
 
+from physai.deploy.checked import AnswerError, CheckedPolicy
 from physai.deploy.command import Command, State
 from physai.deploy.following import Following, Progress, Strain
 from physai.deploy.goals import Goal, GoalError, accept
-from physai.deploy.interfaces import make_interface
+from physai.deploy.interfaces import INTERFACES
 from physai.deploy.joints import Heard, JointReader, JointState, JointStateError
 from physai.deploy.limits import LATE, VelocityLimits, check
 from physai.deploy.metadata import GOAL, LAST_COMMAND, MEMORY
 from physai.deploy.parameters import ControllerConfig
 from physai.deploy.policy import Policy
-from physai.errors import UserError
 
 _STILL = 3  # updates in a row at the same time
 _STEP = 0.75  # periods; what is asked again sooner is the same step of a policy that remembers
-_INPUTS = ("joint_position", "joint_velocity", GOAL, LAST_COMMAND, MEMORY)
 _MOVED = 0.1  # tolerances; a goal that moves by less is still the same
-
-Motion = tuple[np.ndarray, np.ndarray]
-"""A velocity [n], rad/s, and what the policy remembers, [H]."""
 
 
 class Controller:
@@ -55,29 +51,24 @@ class Controller:
     ) -> None:
         self.policy = policy
         metadata = policy.metadata
-        for signal in metadata.inputs:
-            if signal.name not in _INPUTS:
-                raise UserError(f"the policy takes '{signal.name}': this controller can tell {', '.join(_INPUTS)}")
+        self._asked = CheckedPolicy(policy, stopwatch)
+        self._interface = INTERFACES[metadata.command.quantity](metadata)
         self._period = 1.0 / metadata.control_rate
         self._tolerance = np.array([tolerance.value for tolerance in metadata.tolerances])
-        self._stopwatch = stopwatch
-        self._zeros = self._last = np.zeros(len(policy.metadata.joints))
         self._counters: Counter[str] = Counter()
         self._latched: State | None = None
         self._latch_reason = ""
         config = config or ControllerConfig()
-        self._interface = make_interface(metadata, config)
-        self._robot = JointReader(policy.metadata, config)
+        self._robot = JointReader(metadata, config)
         self._progress = Progress()
-        self._strain = Strain(policy.metadata)
+        self._strain = Strain(metadata)
         self.configure(config)
         self._now: float | None = None
         self._still = 0  # updates in a row at that time
         self._received = -math.inf  # when the robot was heard of: its joint that was not for longest
         self._goal: np.ndarray | None = None
         self._reached = False
-        self._nothing = np.zeros(policy.metadata.memory_size, np.float32)
-        self._memory = self._nothing
+        self._memory = self._asked.nothing
         self._step = 0.0  # s since the memory's last one
         self._needed = 0  # good joint states until a hold ends
         self._hold_reason = ""
@@ -95,11 +86,9 @@ class Controller:
         check(config, self.policy.metadata)
         self.config = config
         self._robot.configure(config)
-        self._interface.configure(config)
         self._limits = VelocityLimits(self.policy.metadata, config)
+        self._interface.configure(config, self._limits)
         self._following = Following(self.policy.metadata, config)
-        # A lower velocity holds at once, whatever the acceleration limit: the margin may be too narrow for another.
-        self._last = self._limits.scaled(self._last)
         self._check_position()
 
     def update(
@@ -124,11 +113,11 @@ class Controller:
         """
         reasons: list[str] = []
         self._counters["updates"] += 1
-        elapsed, stop = self._take_time(now, reasons)
+        passed, stop = self._take_time(now, reasons)
         if goal is not None:
             self._take_goal(goal, reasons)
         if self._command.state is State.ACTIVE and not stop:
-            self._following.commanded(now, self._last)
+            self._following.commanded(now, self._interface.way(passed))
         else:
             self._following.restart()
         if joint_state is not None and math.isfinite(now):
@@ -139,26 +128,24 @@ class Controller:
             what = "joint state" if oldest is None else f"state of '{oldest}'"
             reasons.append(self._hold("state old", f"the last {what} is {now - self._received:.3f} s old"))
         state = self._state(interlocks, reasons)
-        motion = None
+        elapsed = min(passed, self._period)
+        velocity, memory = None, self._asked.nothing
         if state is State.ACTIVE:
             if not stop:
-                motion = self._drive(elapsed, reasons)
+                velocity, memory = self._drive(elapsed, reasons)
             state = State.HOLD if self._gave_up else State.REACHED if self._reached else State.ACTIVE
         if self._latched not in (None, state):  # an emergency stop while the policy was asked, or a policy that failed
-            motion, state = None, self._latched
+            velocity, memory, state = None, self._asked.nothing, self._latched
             reasons.append(self._latch_reason)
         if state is not self._command.state:
             self._since = self._now or 0.0
             self._counters[f"entered {state.value}"] += 1
-        position = self._robot.position
-        if motion is None:
-            value, self._last, self._memory = self._interface.stand(position), self._zeros, self._nothing
-        else:
-            velocity, self._memory = motion
-            value, went = self._interface.drive(velocity, position, elapsed)
-            self._last = self._limits.scaled(went)  # a position may have been taken along by the arm, and faster
-        unheard = state is State.WAITING and self._received == -math.inf
-        self._command = Command(None if unheard or value is None else value.copy(), state, tuple(reasons))
+        self._memory = memory
+        value = self._send(velocity, elapsed, reasons)
+        if value is not None:
+            unheard = state is State.WAITING and self._received == -math.inf
+            value = None if unheard else value.copy()
+        self._command = Command(value, state, tuple(reasons))
         return self._command
 
     @property
@@ -214,7 +201,7 @@ class Controller:
         }
 
     def _take_time(self, now: float, reasons: list[str]) -> tuple[float, bool]:
-        """Return the time since the last update, at most a period, and whether this tick must be zero."""
+        """Return the time since the last update, and whether the arm must stand in this tick."""
         if not math.isfinite(now):
             reasons.append(self._hold("clock", "the time is not finite"))
             return 0.0, True
@@ -230,8 +217,8 @@ class Controller:
         if elapsed > LATE * self._period:
             self._counters["late updates"] += 1
             reasons.append(f"update came after {elapsed:.3f} s, {elapsed / self._period:.1f} periods")
-            return self._period, True
-        return min(elapsed, self._period), False
+            return elapsed, True
+        return elapsed, False
 
     def _take_goal(self, goal: Goal, reasons: list[str]) -> None:
         try:
@@ -247,7 +234,7 @@ class Controller:
         if self._goal is None or np.abs(new - self._goal).max() > _MOVED * self._tolerance[0]:
             self._reached, self._gave_up = False, ""
             self._progress.restart()
-            self._memory = self._nothing
+            self._memory = self._asked.nothing
         self._goal = new
 
     def _take_state(self, now: float, joint_state: JointState, timely: bool, reasons: list[str]) -> None:
@@ -334,65 +321,60 @@ class Controller:
             reasons.append("no goal yet")
         return State.WAITING if interlocks or self._goal is None else State.ACTIVE
 
-    def _drive(self, elapsed: float, reasons: list[str]) -> Motion | None:
-        """Ask the policy, and limit what it wants; return the velocity, and what it remembers; None to stand."""
+    def _drive(self, elapsed: float, reasons: list[str]) -> tuple[np.ndarray | None, np.ndarray]:
+        """Ask the policy, and limit what it wants; return the velocity, or None to stand, and the new memory."""
         assert self._goal is not None
-        robot = self._robot
-        started = self._stopwatch()
+        robot, config = self._robot, self.config
         try:
-            error = np.asarray(self.policy.error(robot.turned, self._goal))
-            if error.shape != self._tolerance.shape or not ((error >= 0) & (error < math.inf)).all():
-                self._policy_failed("error", f"gave the error {error.tolist()}", reasons)
-                return None
-            tolerances = float((error / self._tolerance).max())
-            self._reached = tolerances < (self.config.reached_hysteresis if self._reached else 1)
+            error = self._asked.error(robot.turned, self._goal)
+            far = float((error / self._tolerance).max())
+            self._reached = far < (config.reached_hysteresis if self._reached else 1.0)
             if self._reached:
                 self._progress.restart()
-                return None
-            if self._progress.waited(tolerances, elapsed) > self.config.progress_timeout:
-                self._give_up(error, reasons)
-                return None
-            answer, memory = self._ask(self._goal)
-        except Exception as error:  # a policy is a foreign program
-            self._policy_failed("exception", f"raised {type(error).__name__}: {_last_line(error)}", reasons)
-            return None
-        took = self._stopwatch() - started
-        if answer.shape != self._zeros.shape:
-            self._policy_failed("shape", f"gave the shape {list(answer.shape)}", reasons)
-            return None
-        if memory.shape != self._nothing.shape:
-            self._policy_failed("shape", f"gave a memory of the shape {list(memory.shape)}", reasons)
-            return None
-        if not np.isfinite(answer).all():
-            self._policy_failed("not finite", "gave a command that is not finite", reasons)
-            return None
-        if not np.isfinite(memory).all():
-            self._policy_failed("not finite", "gave a memory that is not finite", reasons)
-            return None
-        if took > self.config.policy_timeout:
-            self._policy_failed("slow", f"took {took * 1e3:.1f} ms", reasons)
-            return None
+                return None, self._asked.nothing
+            if self._progress.waited(far, elapsed) > config.progress_timeout:
+                return self._give_up(error, reasons)
+            target = self._interface.begin(robot.position, robot.turned)
+            known = {
+                "joint_position": robot.turned,
+                "joint_velocity": robot.velocity,
+                GOAL: self._goal,
+                MEMORY: self._memory,
+                LAST_COMMAND: self._interface.last_command,
+            }
+            answer, memory = self._asked.answer(known, config.policy_timeout)
+        except AnswerError as failure:
+            return self._policy_failed(failure, reasons)
         self._failures = 0
-        wanted = self._interface.velocity(answer, robot.position, robot.turned)
-        if self._limits.out_of_range(wanted):
+        wanted = self._interface.wanted(answer)
+        if self._limits.out_of_range(wanted, self._interface.rounding):
             self._counters["commands clamped"] += 1
             reasons.append("the policy's command was beyond its range")
-        velocity, held_back = self._limits.apply(wanted, robot.position, self._last, elapsed)
+        velocity, held_back = self._limits.apply(wanted, robot.position, target, self._interface.velocity, elapsed)
         if held_back is not None:
             self._counters["ticks at a position limit"] += 1
             reasons.append(held_back)
         return velocity, self._remember(memory, elapsed)
 
-    def _give_up(self, error: np.ndarray, reasons: list[str]) -> None:
+    def _send(self, velocity: np.ndarray | None, elapsed: float, reasons: list[str]) -> np.ndarray | None:
+        """Return what makes the robot go on with a velocity, or stand; None where that is not known yet."""
+        if velocity is None:
+            return self._interface.stand(self._robot.position)
+        value, waits = self._interface.drive(velocity, elapsed)
+        if waits is not None:
+            self._counters["ticks at max_lead"] += 1
+            reasons.append(waits)
+        return value
+
+    def _give_up(self, error: np.ndarray, reasons: list[str]) -> tuple[None, np.ndarray]:
         self._counters["holds: no progress"] += 1
-        far = ", ".join(
-            f"{value:.3f} {tolerance.unit}"
-            for value, tolerance in zip(error.tolist(), self.policy.metadata.tolerances, strict=True)
-        )
+        tolerances = self.policy.metadata.tolerances
+        far = ", ".join(f"{each:.3f} {tolerance.unit}" for each, tolerance in zip(error, tolerances, strict=True))
         self._gave_up = self._hold_reason = (
             f"no progress for {self.config.progress_timeout:g} s, {far} from the goal: waiting for another"
         )
         reasons.append(self._gave_up)
+        return None, self._asked.nothing
 
     def _remember(self, memory: np.ndarray, elapsed: float) -> np.ndarray:
         """Return the new memory, or the old one: who asks more often than in training must not make time run faster."""
@@ -402,30 +384,10 @@ class Controller:
         self._step -= self._period
         return memory
 
-    def _ask(self, goal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the policy's answer, and its new memory."""
-        robot = self._robot
-        told = {
-            "joint_position": robot.turned,
-            "joint_velocity": robot.velocity,
-            GOAL: goal,
-            MEMORY: self._memory,
-            **self._interface.inputs(robot.position, robot.turned),
-        }
-        answer = self.policy(*(told[signal.name] for signal in self.policy.metadata.inputs))
-        if not self.policy.metadata.memory_size:
-            return np.asarray(answer, dtype=np.float64), self._nothing
-        command, memory = answer
-        return np.asarray(command, dtype=np.float64), np.asarray(memory, dtype=np.float32)
-
-    def _policy_failed(self, kind: str, what: str, reasons: list[str]) -> None:
-        self._counters[f"policy failures: {kind}"] += 1
+    def _policy_failed(self, failure: AnswerError, reasons: list[str]) -> tuple[None, np.ndarray]:
+        self._counters[f"policy failures: {failure.kind}"] += 1
         self._failures += 1
-        reasons.append(f"the policy {what}")
+        reasons.append(f"the policy {failure}")
         if self._failures >= self.config.policy_failures:
-            self._fault("policy", f"the policy failed {self._failures} times in a row; at last it {what}")
-
-
-def _last_line(error: Exception) -> str:
-    """What went wrong; TorchScript's errors begin with a traceback."""
-    return (str(error).strip().splitlines() or ["no reason given"])[-1][:80]
+            self._fault("policy", f"the policy failed {self._failures} times in a row; at last it {failure}")
+        return None, self._asked.nothing

@@ -72,8 +72,8 @@ class Following:
         self._rows, self._sample_at = 0, -math.inf  # of measurements, and when the last of them was taken
         self._commanded[:] = 0.0
 
-    def commanded(self, now: float, velocity: np.ndarray) -> None:
-        """Take velocities [n], rad/s, that were commanded until a time, s, since the last such time."""
+    def commanded(self, now: float, way: np.ndarray) -> None:
+        """Take how far each joint was told to go, [n] rad, until a time, s, since the last such time."""
         if not self._begun:
             self._begun = True
             self._start = self._at = now
@@ -82,9 +82,10 @@ class Following:
             return
         while (at := self._start + (self._told + 1) * self._period) <= now:
             self._told += 1
+            share = (at - self._at) / (now - self._at) if now > self._at else 1.0
             self._commanded[:-1] = self._commanded[1:]
-            self._commanded[-1] = self._path + velocity * (at - self._at)
-        self._path = self._path + velocity * (now - self._at)
+            self._commanded[-1] = self._path + way * share
+        self._path = self._path + way
         self._at = now
 
     def heard(self, received: float, motion: np.ndarray) -> Deviation | None:

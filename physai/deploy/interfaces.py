@@ -1,131 +1,159 @@
-"""What a robot is told: velocities as they are, or positions that move at these velocities."""
+"""What drives a robot, joint velocities or joint positions: what is sent while it drives, and while it stands."""
 
-from typing import Protocol
+import math
 
 import numpy as np
 
-from physai.deploy.metadata import LAST_COMMAND, Metadata
+from physai.deploy.limits import VelocityLimits
+from physai.deploy.metadata import Metadata
 from physai.deploy.parameters import ControllerConfig
 from physai.signals import Quantity
 
-
-class CommandInterface(Protocol):
-    """Between the velocities that a controller decides on, whose limits hold for each robot, and what a robot takes."""
-
-    def configure(self, config: ControllerConfig) -> None:
-        """Take other limits."""
-
-    def inputs(self, position: np.ndarray, turned: np.ndarray) -> dict[str, np.ndarray]:
-        """Return what a policy of this interface also takes.
-
-        Args:
-            position: Where joints are, rad, [n].
-            turned: The same, as the policy sees it: continuous joints between -π and π.
-        """
-
-    def velocity(self, answer: np.ndarray, position: np.ndarray, turned: np.ndarray) -> np.ndarray:
-        """Return the velocity [n], rad/s, that a policy's answer [n] asks for."""
-
-    def drive(self, velocity: np.ndarray, position: np.ndarray, elapsed: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return the command [n] for a velocity [n], rad/s, and the velocity that it stands for, [n]."""
-
-    def stand(self, position: np.ndarray) -> np.ndarray | None:
-        """Return the command [n] that stands still, where the joints were as this began; None if that is not known."""
-
-    def standstill(self, position: np.ndarray) -> np.ndarray:
-        """Return the command [n] that would stand still where the joints are now."""
+_ROUNDING = 1e-6  # rad; of a position of single precision within a turn
 
 
 class VelocityInterface:
-    """Commands are velocities; zero stands still."""
-
-    def __init__(self, metadata: Metadata) -> None:
-        self._zeros = np.zeros(len(metadata.joints))
-
-    def configure(self, config: ControllerConfig) -> None:
-        """See :class:`CommandInterface`."""
-
-    def inputs(self, position: np.ndarray, turned: np.ndarray) -> dict[str, np.ndarray]:
-        """See :class:`CommandInterface`."""
-        return {}
-
-    def velocity(self, answer: np.ndarray, position: np.ndarray, turned: np.ndarray) -> np.ndarray:
-        """See :class:`CommandInterface`."""
-        return answer
-
-    def drive(self, velocity: np.ndarray, position: np.ndarray, elapsed: float) -> tuple[np.ndarray, np.ndarray]:
-        """See :class:`CommandInterface`."""
-        return velocity, velocity
-
-    def stand(self, position: np.ndarray) -> np.ndarray | None:
-        """See :class:`CommandInterface`."""
-        return self._zeros
-
-    def standstill(self, position: np.ndarray) -> np.ndarray:
-        """See :class:`CommandInterface`."""
-        return self._zeros
-
-
-class PositionInterface:
-    """Commands are positions: the last one moves on; a robot that stands is told where it was as it stopped.
+    """The robot is sent joint velocities; it stands at zero.
 
     Args:
         metadata: Of the policy.
-        config: ``max_lead`` is used.
+
+    Attributes:
+        velocity: What it was told last, rad/s, [n].
+        last_command: An input of policies that command positions; None.
+        rounding: How far single precision may put a wanted velocity beyond its range, rad/s.
     """
 
-    def __init__(self, metadata: Metadata, config: ControllerConfig) -> None:
-        self._period = 1.0 / metadata.control_rate
-        self._lower, self._upper = metadata.position_limit.T
-        self._continuous = np.isinf(metadata.position_limit).all(axis=1)
-        self._target: np.ndarray | None = None
-        self._driving = False
-        self.configure(config)
+    rounding = 0.0
+    last_command: np.ndarray | None = None
 
-    def configure(self, config: ControllerConfig) -> None:
-        """See :class:`CommandInterface`."""
-        self._max_lead = config.max_lead
+    def __init__(self, metadata: Metadata) -> None:
+        self._zeros = self.velocity = np.zeros(len(metadata.joints))
 
-    def inputs(self, position: np.ndarray, turned: np.ndarray) -> dict[str, np.ndarray]:
-        """See :class:`CommandInterface`."""
-        return {LAST_COMMAND: turned + self._lead(position)}
+    def configure(self, config: ControllerConfig, limits: VelocityLimits) -> None:
+        """Take other limits. A lower velocity holds at once: the margin may be too narrow for another."""
+        self.velocity = limits.scaled(self.velocity)
 
-    def velocity(self, answer: np.ndarray, position: np.ndarray, turned: np.ndarray) -> np.ndarray:
-        """See :class:`CommandInterface`."""
-        return (answer - (turned + self._lead(position))) / self._period
+    def begin(self, position: np.ndarray, turned: np.ndarray) -> np.ndarray:
+        """Prepare to ask the policy; return where the joints are told to be, rad, [n]: here, where they are.
 
-    def drive(self, velocity: np.ndarray, position: np.ndarray, elapsed: float) -> tuple[np.ndarray, np.ndarray]:
-        """See :class:`CommandInterface`; a command is never far from where its joint is."""
-        lead = self._lead(position)
-        # A joint may be beyond a limit: the command must not be farther out than it is.
-        lowest = np.maximum(-self._max_lead, np.minimum(self._lower - position, 0.0))
-        highest = np.minimum(self._max_lead, np.maximum(self._upper - position, 0.0))
-        ahead = np.minimum(np.maximum(lead + velocity * elapsed, lowest), highest)
-        self._target, self._driving = position + ahead, True
-        return self._target, (ahead - lead) / elapsed if elapsed > 0 else velocity
+        Args:
+            position: Where they are, rad, [n], as the robot counts.
+            turned: The same, as the policy counts.
+        """
+        return position
+
+    def wanted(self, answer: np.ndarray) -> np.ndarray:
+        """Turn what the policy answers into velocities, rad/s, [n]."""
+        return answer
+
+    def drive(self, velocity: np.ndarray, elapsed: float) -> tuple[np.ndarray, str | None]:
+        """Go on with velocities [n], rad/s, within the limits, ``elapsed`` s after the last update.
+
+        Returns:
+            What to send, [n]; and why a joint is not told to go as far as that, if one is not.
+        """
+        self.velocity = velocity
+        return velocity, None
 
     def stand(self, position: np.ndarray) -> np.ndarray | None:
-        """See :class:`CommandInterface`."""
-        if self._driving or self._target is None:
-            self._driving = False
-            self._target = position.copy() if np.isfinite(position).all() else None
+        """Stand still; return what to send, [n], or None if that is not known yet.
+
+        Args:
+            position: Where the joints are, rad, [n]; NaN where that is not known.
+        """
+        self.velocity = self._zeros
+        return self.velocity
+
+    def standstill(self, position: np.ndarray) -> np.ndarray:
+        """Return what would make the robot stand where its joints are now, [n]."""
+        return self._zeros
+
+    def way(self, passed: float) -> np.ndarray:
+        """How far the joints were told to go, rad, [n], from the last update until now, ``passed`` s later."""
+        return self.velocity * passed
+
+
+class PositionInterface(VelocityInterface):
+    """The robot is sent joint positions, a target that moves with a limited velocity; it stands where it was found.
+
+    The target stays within ``max_lead`` of where each joint is, so that an arm that was held up does not leap, and
+    within the position limits. It is counted as the robot counts: where a continuous joint is counted from -π to π, the
+    target goes around with it.
+
+    Args:
+        metadata: Of the policy.
+    """
+
+    def __init__(self, metadata: Metadata) -> None:
+        super().__init__(metadata)
+        self._period = 1.0 / metadata.control_rate
+        self.rounding = _ROUNDING / self._period
+        self._continuous = np.isinf(metadata.position_limit).all(axis=1)
+        self._target: np.ndarray | None = None
+        self._drives = False
+        self._way = self._zeros
+
+    def configure(self, config: ControllerConfig, limits: VelocityLimits) -> None:
+        """See :class:`VelocityInterface`."""
+        super().configure(config, limits)
+        self._limits, self._lead = limits, config.max_lead
+
+    def begin(self, position: np.ndarray, turned: np.ndarray) -> np.ndarray:
+        """See :class:`VelocityInterface`; an arm that stood begins where it is."""
+        target = self._turned(position) if self._drives else None
+        self._position, self._before = position, position.copy() if target is None else target
+        # As the policy sees it: what it adds to the last command is then exactly what it wants.
+        self.last_command = (self._before - (position - turned)).astype(np.float32)
+        return self._before
+
+    def wanted(self, answer: np.ndarray) -> np.ndarray:
+        """See :class:`VelocityInterface`."""
+        return (answer - self.last_command) / self._period
+
+    def drive(self, velocity: np.ndarray, elapsed: float) -> tuple[np.ndarray, str | None]:
+        """See :class:`VelocityInterface`."""
+        position = self._position
+        target = self._before + velocity * elapsed
+        ahead = (np.abs(target - position) > self._lead).any()
+        least, most = self._limits.room(position)
+        least, most = np.maximum(least, position - self._lead), np.minimum(most, position + self._lead)
+        self._target = np.minimum(np.maximum(target, least), most)
+        self._way = self._target - self._before
+        # What was held back did not move: it accelerates anew.
+        self.velocity = np.where(self._target == target, velocity, 0.0)
+        self._drives = True
+        return self._target, f"a command waits {self._lead:g} rad ahead of its joint" if ahead else None
+
+    def stand(self, position: np.ndarray) -> np.ndarray | None:
+        """See :class:`VelocityInterface`; what is far from where it stood, or another robot, stands where it is now."""
+        super().stand(position)
+        self._way = self._zeros
+        target = None if self._drives else self._turned(position)
+        self._drives = False
+        if not np.isfinite(position).all():
+            self._target = None
+        elif target is None or np.abs(target - position).max() > self._lead:
+            self._target = position.copy()
+        else:
+            self._target = target
         return self._target
 
     def standstill(self, position: np.ndarray) -> np.ndarray:
-        """See :class:`CommandInterface`."""
+        """See :class:`VelocityInterface`."""
         return position
 
-    def _lead(self, position: np.ndarray) -> np.ndarray:
-        """How far the command is ahead of the joints, rad; none where they stood."""
-        if not self._driving or self._target is None:
-            return np.zeros_like(position)
-        lead = self._target - position
-        # A source may count a continuous joint from -π to π.
-        return np.where(self._continuous, lead - 2 * np.pi * np.round(lead / (2 * np.pi)), lead)
+    def way(self, passed: float) -> np.ndarray:
+        """See :class:`VelocityInterface`."""
+        return self._way
+
+    def _turned(self, position: np.ndarray) -> np.ndarray | None:
+        """The target, counted in the same turn as the position."""
+        if self._target is None or not self._continuous.any():
+            return self._target
+        turns = np.where(self._continuous, np.round((position - self._target) / (2 * math.pi)), 0.0)
+        return self._target + 2 * math.pi * turns
 
 
-def make_interface(metadata: Metadata, config: ControllerConfig) -> CommandInterface:
-    """Return the interface of a policy's commands."""
-    if metadata.command.quantity is Quantity.JOINT_POSITION:
-        return PositionInterface(metadata, config)
-    return VelocityInterface(metadata)
+INTERFACES = {Quantity.JOINT_VELOCITY: VelocityInterface, Quantity.JOINT_POSITION: PositionInterface}
+"""By what the policy commands."""

@@ -14,7 +14,7 @@ from physai.deploy.following import Following
 from physai.physics import ParameterLayout, RandomizationConfig, RobotState
 from physai.physics.pybullet import PyBulletPhysics
 from physai.robots import RobotSpec
-from tests.deploy.conftest import Troubled
+from tests.deploy.troubled import Troubled
 
 PERIOD = 0.02
 NAMES = ("joint1", "joint2")
@@ -185,7 +185,7 @@ def test_states_that_come_seldom_and_not_on_time_are_measured_at_their_own_time(
     speed = np.array([2.0, -0.5])
     for tick in range(100):
         now = tick * PERIOD
-        following.commanded(now, speed)
+        following.commanded(now, speed * PERIOD)
         if tick % every == every - 1:
             motion = np.concatenate([speed * (now - age), speed])
             assert following.heard(now - age, motion) is None

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from physai.deploy import Controller, ControllerConfig, Goal, JointState, State
-from tests.deploy.conftest import Troubled
-from tests.deploy.test_controller import FAR_GOAL, LENIENT, Robot, is_stopped
+from tests.deploy.robot import FAR_GOAL, LENIENT, Robot, is_stopped
+from tests.deploy.troubled import Troubled
 
 PERIOD = 0.02
 NAMES = ("joint1", "joint2")

@@ -1,6 +1,5 @@
 """Policies that remember, on a robot: what is loaded, what is refused, and when the controller begins anew."""
 
-import json
 import math
 
 import numpy as np
@@ -9,7 +8,7 @@ import pytest
 from physai.deploy import Controller, ControllerConfig, Goal, JointState, State, load_policy
 from physai.deploy.metadata import describe_signal
 from physai.signals import Quantity, Signal
-from tests.deploy.files import METADATA, pack, records, refusal, sign
+from tests.deploy.files import described, refusal
 
 PERIOD, SIZE = 0.02, 32
 GOAL, OTHER_GOAL = Goal([-0.4, -0.1], "base"), Goal([-0.1, -0.4], "base")
@@ -44,13 +43,6 @@ def test_in_torchrl_code_it_has_its_keys(recurrent):
     module = recurrent.as_tensordict_module()
     assert module.in_keys == ["joint_position", "joint_velocity", "goal", "memory"]
     assert module.out_keys == ["joint_velocity_command", "new_memory"]
-
-
-def change(content, edit):
-    parts = records(content)
-    metadata = json.loads(parts[METADATA])
-    edit(metadata)
-    return pack(sign(parts | {METADATA: json.dumps(metadata).encode()}))
 
 
 def set_size(size):
@@ -100,7 +92,7 @@ def golden_nan(metadata):
     ],
 )
 def test_metadata_that_do_not_fit_its_memory_are_refused(recurrent_content, path, edit, message):
-    path.write_bytes(change(recurrent_content, edit))
+    path.write_bytes(described(recurrent_content, edit))
     assert message in refusal(path)
 
 
@@ -111,7 +103,7 @@ def test_a_policy_without_memory_that_claims_one_is_refused(content, path):
         pairs = len(metadata["golden"]["goal"])
         metadata["golden"] |= {"memory": [[0.0]] * pairs, "new_memory": [[0.0]] * pairs}
 
-    path.write_bytes(change(content, claim))
+    path.write_bytes(described(content, claim))
     assert "its forward takes ['joint_position', 'joint_velocity', 'goal'], not" in refusal(path)
 
 
