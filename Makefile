@@ -53,10 +53,11 @@ bench: $(VENV)/.installed-dev  ## Measure speed against bare PyBullet, rclpy and
 	@echo "==> Measuring (all of it takes an hour and a half; ARGS=--collection and the like choose a part)"
 	$(BIN)/python -m physai.bench $(ARGS)
 
-check: $(VENV)/.installed-dev  ## Check format, lint and types
+check: $(VENV)/.installed-dev  ## Check format, lint, types and the direction of imports
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/mypy
+	$(BIN)/lint-imports
 
 format: $(VENV)/.installed-dev  ## Format the code
 	$(BIN)/ruff format .

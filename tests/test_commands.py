@@ -182,7 +182,7 @@ def test_resume_refuses_a_truncated_checkpoint(run, copied):
 
 def test_resume_refuses_a_truncated_config(run, copied):
     config = copied / ".hydra" / "config.yaml"
-    config.write_text(config.read_text()[:300])
+    config.write_text(config.read_text()[:250])
     code, _, error = run("train", "resume=run")
     assert code == 2
     assert "the run's config is damaged" in error

@@ -82,7 +82,6 @@ def run_training(
         trainer = make_trainer(config, run_dir, agent, evaluation, resume)
         trainer.fit(stop)
         if stop:
-            trainer.save()
             raise Interrupted(stop[0])
         print(f"Evaluating the best policy on {config.evaluation.episodes:,} goals it has never seen ...", flush=True)
         result = TrainedPolicy(run_dir, "best", config=config).evaluate(config.evaluation.episodes)

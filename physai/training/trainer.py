@@ -104,7 +104,7 @@ class Trainer:
         self.clock.seconds -= time.perf_counter() - started
 
     def fit(self, stop: Sequence[int] = ()) -> None:
-        """Train until the end, or until there is something in ``stop``.
+        """Train until the end, or until there is something in ``stop``, and save then.
 
         Raises:
             UserError: If the disk is full or a number is not finite; the last good checkpoint is kept.
@@ -130,6 +130,8 @@ class Trainer:
                 for callback in self.callbacks:
                     callback.after_batch(self, batch, values)
                 self.clock.seconds += time.perf_counter() - updated
+            if stop:
+                self.save()
         except NonFiniteError as error:
             raise UserError(self._keep_evidence(error)) from error
         except OSError as error:

@@ -60,7 +60,7 @@ def test_environments_of_the_page_on_training_can_be_used_as_shown(run):
 @pytest.mark.slow
 def test_the_page_on_deployment_loads_a_policy_and_reaches_a_goal(run):
     printed = run("docs/deploy.md")
-    assert "('joint1', 'joint2') (0.3, 0.53) 50.0" in printed
+    assert "('joint1', 'joint2') Ring(inner=0.3, outer=0.53) 50.0" in printed
     assert "State.REACHED" in printed
 
 
