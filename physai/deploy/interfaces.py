@@ -120,8 +120,10 @@ class PositionInterface(VelocityInterface):
         least, most = np.maximum(least, position - self._lead), np.minimum(most, position + self._lead)
         self._target = np.minimum(np.maximum(target, least), most)
         self._way = self._target - self._before
-        # What was held back did not move: it accelerates anew.
-        self.velocity = np.where(self._target == target, velocity, 0.0)
+        # What was held back goes on from the velocity that it had; not from one to which it was pulled back.
+        went = self._way / elapsed if elapsed > 0 else self._way
+        went = np.minimum(np.maximum(went, np.minimum(velocity, 0.0)), np.maximum(velocity, 0.0))
+        self.velocity = np.where(self._target == target, velocity, went)
         self._drives = True
         return self._target, f"a command waits {self._lead:g} rad ahead of its joint" if ahead else None
 

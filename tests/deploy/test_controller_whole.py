@@ -68,8 +68,8 @@ def test_it_brings_the_simulated_arm_to_at_least_9_of_10_goals_within_its_limits
     limit = policy.metadata.position_limit
     reached, last = np.zeros(robots, dtype=bool), np.zeros((robots, 2))
     for tick in range(round(40 / PERIOD)):
-        position = simulation.joint_position.astype(float)
-        velocity = simulation.joint_velocity.astype(float)
+        position = simulation.state.joint_position.astype(float)
+        velocity = simulation.state.joint_velocity.astype(float)
         assert (position >= limit[:, 0]).all()
         assert (position <= limit[:, 1]).all()
         assert (np.abs(velocity) <= 0.3 * 1.05).all()
@@ -83,7 +83,7 @@ def test_it_brings_the_simulated_arm_to_at_least_9_of_10_goals_within_its_limits
         assert (np.abs(commands) <= 0.3 + 1e-9).all()
         assert (np.abs(commands - last)[commands != 0] <= 2.0 * PERIOD + 1e-9).all()
         last = commands
-        simulation.step(commands / reacher.max_velocity)
+        simulation.step(commands / policy.metadata.command_limit)
         if reached.all():
             break
     simulation.close()

@@ -37,7 +37,7 @@ class World(Hearing):
         self.turns = [math.isinf(upper) for upper in self.upper]
         self.strongest = policy.metadata.effort_limit.tolist()
         # The arm, and two clocks: that of the controller, and that of the stamps.
-        self.position, self.velocity, self.last = list(position), STILL, STILL
+        self.position, self.velocity, self.last = list(position), STILL, [(0.0, 0.0)] * 2
         self.now, self.stamp, self.started = 1000.0, 50.0, False
         self.source, self.turn = None, 0
         # The model, of the controller,
@@ -104,12 +104,20 @@ class World(Hearing):
     def configure(self, config):
         self._tell("configure", config)
         self._take_config(config)
-        self.last = self._slowed(self.last)
+        self.last = self._slowed(self.last, self.config.max_velocity)
         self._see_position()
 
-    def _slowed(self, velocities):
-        share = min(1.0, self.config.max_velocity / max(*map(abs, velocities), 1e-9))
-        return [velocity * share for velocity in velocities]
+    @staticmethod
+    def _slowed(ranges, fastest):
+        """Ranges of velocities that are slowed down together, if one of them is too fast."""
+        share = min(1.0, fastest / max(abs(v) for pair in (*ranges, (1e-9,)) for v in pair))
+        exact = all(low == high for low, high in ranges)
+        return [
+            (low * share, high * share)
+            if exact
+            else (max(-fastest, min(low, low * share)), min(fastest, max(high, high * share)))
+            for low, high in ranges
+        ]
 
     def _take_config(self, config):
         self.config, self.motion = config, Motion(config)
@@ -145,7 +153,7 @@ class World(Hearing):
         if stop or self.state is not State.ACTIVE:
             self.motion.start = None
         else:
-            told = self.targets.way if self.positions else [v * (now - before) for v in self.last]
+            told = self.targets.way if self.positions else [v * (now - before) for v, _ in self.last]
             self.motion.commanded(now, told)
         refused = 0
         if state is not None and math.isfinite(now):
@@ -195,7 +203,7 @@ class World(Hearing):
             assert velocity == STILL, command
             assert command.reasons or expected is State.REACHED
         self._check(velocity, elapsed, stop, "a joint" in said, sides)
-        self.velocity = self.last = velocity
+        self.velocity, self.last = velocity, self._ranges(velocity, stop, elapsed, sides)
         return command
 
     def _velocity_of(self, target, stop, elapsed, sides):
@@ -207,14 +215,22 @@ class World(Hearing):
         targets.moved(target, self.accepted, lead)
         self.seen["held near the arm"] += len(targets.held)
         if elapsed:
-            velocity = [way / elapsed for way in targets.way]
-        else:  # nothing moved, but for what is stopped at once
-            assert all(abs(way) < 1e-9 or joint in targets.held for joint, way in enumerate(targets.way))
-            velocity = [0.0 if v * side > 0 else v for v, side in zip(self.last, sides, strict=True)]
-            if self._beyond():
-                share = min(1.0, self.slow / max(*map(abs, velocity), 1e-9))
-                velocity = [v * share for v in velocity]
-        return [0.0 if joint in targets.held else v for joint, v in enumerate(velocity)]
+            return [way / elapsed for way in targets.way]
+        assert all(abs(way) < 1e-9 or joint in targets.held for joint, way in enumerate(targets.way))
+        return STILL
+
+    def _ranges(self, velocity, stop, elapsed, sides):
+        """Between which velocities each joint goes on: those of a target that was held back are not seen."""
+        if stop or not self.positions:
+            return [(v, v) for v in velocity]
+        if elapsed:
+            rows = enumerate(velocity)
+            return [(min(0.0, v), max(0.0, v)) if joint in self.targets.held else (v, v) for joint, v in rows]
+        inward = [
+            (low * (low * side <= 0), high * (high * side <= 0))
+            for (low, high), side in zip(self.last, sides, strict=True)
+        ]
+        return self._slowed(inward, self.slow) if self._beyond() else inward
 
     def finish(self):
         """Compare the controller's counters and what it remembers with the model's."""
@@ -322,22 +338,20 @@ class World(Hearing):
     def _check(self, velocity, elapsed, stopped, held_back, sides):
         """See that the limits hold."""
         change, beyond = self.acceleration * elapsed, any(sides) and self._beyond()
-        slowed = beyond and max(map(abs, self.last)) > self.slow
-        for joint, (new, last, side) in enumerate(zip(velocity, self.last, sides, strict=True)):
-            if joint in self.targets.held:  # where the arm is counts more than how fast
+        slowed = beyond and max(abs(v) for pair in self.last for v in pair) > self.slow
+        for joint, (new, (low, high), side) in enumerate(zip(velocity, self.last, sides, strict=True)):
+            if joint in self.targets.held or (self.positions and not elapsed):  # where the arm is counts more
                 continue
             assert abs(new) <= self.fastest  # so, it is finite
             self.seen["at a limit"] += side != 0 and not stopped
             assert new * side <= self.rounding, (new, side)
-            if not stopped and last * side > self.rounding:
+            if not stopped and min(low * side, high * side) > self.rounding:
                 self.seen["stopped at a limit"] += 1
-                assert abs(new) <= self.rounding, (new, last)
-            elif slowed:  # at once, but not to another direction
-                assert (
-                    stopped or min(0.0, last - change) - self.rounding <= new <= max(0.0, last + change) + self.rounding
-                )
-            else:
-                assert stopped or abs(new - last) <= change + self.rounding, (new, last, change)
+                assert abs(new) <= self.rounding, (new, low)
+            elif not stopped and max(low * side, high * side) <= self.rounding:
+                if slowed:  # at once, but not to another direction
+                    low, high = min(0.0, low), max(0.0, high)
+                assert low - change - self.rounding <= new <= high + change + self.rounding, (new, low, high, change)
         if not stopped:
             assert any(sides) or not held_back
             assert held_back or not beyond
