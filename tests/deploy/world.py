@@ -349,16 +349,18 @@ class World(Hearing):
                 self.seen["stopped at a limit"] += 1
                 assert abs(new) <= self.rounding, (new, low)
             elif not stopped and max(low * side, high * side) <= self.rounding:
+                low, high = low - change, high + change
                 if slowed:  # at once, but not to another direction
                     low, high = min(0.0, low), max(0.0, high)
-                assert low - change - self.rounding <= new <= high + change + self.rounding, (new, low, high, change)
+                assert low - self.rounding <= new <= high + self.rounding, (new, low, high, change)
         if not stopped:
             assert any(sides) or not held_back
             assert held_back or not beyond
             if beyond:
                 self.seen["beyond a limit"] += 1
                 self.seen["slowed beyond a limit"] += slowed
-                assert max(map(abs, velocity)) <= self.slow + self.rounding
+                free = [abs(v) for joint, v in enumerate(velocity) if joint not in self.targets.held]
+                assert max(free, default=0.0) <= self.slow + self.rounding
 
     def _sides(self):
         """At which limit each joint is, or is told to be: 1, -1 or 0."""
