@@ -59,9 +59,11 @@ def test_what_it_gives_away_does_not_lead_back_inside(moving, policy):
 
 
 @pytest.mark.slow
-def test_it_brings_the_simulated_arm_to_at_least_9_of_10_goals_within_its_limits(policy, reacher):
-    robots = 10
-    simulation = Simulation(reacher, robots, seed=7)
+@pytest.mark.parametrize("command", ["joint_velocity", "joint_position"])
+def test_it_brings_the_simulated_arm_to_at_least_9_of_10_goals_within_its_limits(request, env_config, command):
+    policy = request.getfixturevalue("policy" if command == "joint_velocity" else "position_policy")
+    robots, config = 10, env_config("reacher", f"env.robot.command={command}")
+    simulation = Simulation(config, robots, seed=7)
     simulation.reset()
     # A stopwatch of its own: on a busy machine a policy now and then takes longer than its 10 ms.
     controllers = [Controller(policy, stopwatch=lambda: 0.0) for _ in range(robots)]
@@ -73,17 +75,21 @@ def test_it_brings_the_simulated_arm_to_at_least_9_of_10_goals_within_its_limits
         assert (position >= limit[:, 0]).all()
         assert (position <= limit[:, 1]).all()
         assert (np.abs(velocity) <= 0.3 * 1.05).all()
-        commands = np.zeros((robots, 2))
+        commands, standing = np.zeros((robots, 2)), np.zeros((robots, 1), dtype=bool)
         for row, controller in enumerate(controllers):
             state = JointState(NAMES, position[row], velocity[row], tick * PERIOD)
             goal = Goal(simulation.goal[row].astype(float), "base") if tick == 0 else None
-            command = controller.update(tick * PERIOD, state, goal)
-            reached[row] |= command.state is State.REACHED
-            commands[row] = command.value
-        assert (np.abs(commands) <= 0.3 + 1e-9).all()
-        assert (np.abs(commands - last)[commands != 0] <= 2.0 * PERIOD + 1e-9).all()
-        last = commands
-        simulation.step(commands / policy.metadata.command_limit)
+            answer = controller.update(tick * PERIOD, state, goal)
+            standing[row] = answer.state is State.REACHED
+            commands[row] = answer.value
+        reached |= standing[:, 0]
+        moved = commands - simulation.last_command  # what an action makes of the last command
+        rates = moved / PERIOD if command == "joint_position" else commands
+        speeds = np.where(standing, 0.0, rates)
+        assert (np.abs(speeds) <= 0.3 + 1e-6).all()
+        assert (np.abs(speeds - last)[speeds != 0] <= 2.0 * PERIOD + 1e-6).all()
+        last = speeds
+        simulation.step(rates / policy.metadata.command_limit)
         if reached.all():
             break
     simulation.close()
