@@ -68,22 +68,22 @@ def test_it_brings_the_simulated_arm_to_at_least_9_of_10_goals_within_its_limits
     limit = policy.metadata.position_limit
     reached, last = np.zeros(robots, dtype=bool), np.zeros((robots, 2))
     for tick in range(round(40 / PERIOD)):
-        position = simulation.joint_position.astype(float)
-        velocity = simulation.joint_velocity.astype(float)
+        position = simulation.state.joint_position
+        velocity = simulation.state.joint_velocity
         assert (position >= limit[:, 0]).all()
         assert (position <= limit[:, 1]).all()
         assert (np.abs(velocity) <= 0.3 * 1.05).all()
         commands = np.zeros((robots, 2))
         for row, controller in enumerate(controllers):
             state = JointState(NAMES, position[row], velocity[row], tick * PERIOD)
-            goal = Goal(simulation.goal[row].astype(float), "base") if tick == 0 else None
+            goal = Goal(simulation.goal[row], "base") if tick == 0 else None
             command = controller.update(tick * PERIOD, state, goal)
             reached[row] |= command.state is State.REACHED
             commands[row] = command.value
         assert (np.abs(commands) <= 0.3 + 1e-9).all()
         assert (np.abs(commands - last)[commands != 0] <= 2.0 * PERIOD + 1e-9).all()
         last = commands
-        simulation.step(commands / reacher.max_velocity)
+        simulation.step(commands / simulation.spec.command_limit)
         if reached.all():
             break
     simulation.close()
