@@ -70,15 +70,15 @@ def test_it_brings_the_simulated_arm_to_at_least_9_of_10_goals_within_its_limits
     limit = policy.metadata.position_limit
     reached, last = np.zeros(robots, dtype=bool), np.zeros((robots, 2))
     for tick in range(round(40 / PERIOD)):
-        position = simulation.state.joint_position.astype(float)
-        velocity = simulation.state.joint_velocity.astype(float)
+        position = simulation.state.joint_position
+        velocity = simulation.state.joint_velocity
         assert (position >= limit[:, 0]).all()
         assert (position <= limit[:, 1]).all()
         assert (np.abs(velocity) <= 0.3 * 1.05).all()
         commands, standing = np.zeros((robots, 2)), np.zeros((robots, 1), dtype=bool)
         for row, controller in enumerate(controllers):
             state = JointState(NAMES, position[row], velocity[row], tick * PERIOD)
-            goal = Goal(simulation.goal[row].astype(float), "base") if tick == 0 else None
+            goal = Goal(simulation.goal[row], "base") if tick == 0 else None
             answer = controller.update(tick * PERIOD, state, goal)
             standing[row] = answer.state is State.REACHED
             commands[row] = answer.value
