@@ -124,6 +124,9 @@ class Metadata:
         _check_signals(inputs, outputs, tuple(joints))
         region, tolerances = _region(raw), _tolerances(raw)
         goal = next(signal for signal in inputs if signal.name == GOAL)
+        most = float(np.abs(region.bounds).max())
+        if any(each.unit == goal.unit and each.value > most for each in tolerances):
+            raise PolicyError(f"metadata: goal.tolerances: one of more than {most:g} {goal.unit} is met everywhere")
         if goal.shape != (size := len(region.bounds[0]),):
             raise PolicyError(f"metadata: goal.region has {size} numbers, the goal has the shape {list(goal.shape)}")
         for key, kind in _FOR_PEOPLE.items():
@@ -221,6 +224,8 @@ def _signal(raw: dict[str, Any], key: str) -> Signal:
     labels = _get(raw, f"{key}.labels", list)
     if len(labels) not in (0, size) or not all(isinstance(label, str) for label in labels):
         raise PolicyError(f"metadata: {key}.labels must be {size} names, or none")
+    if len(set(labels)) != len(labels):  # a goal that is said by name would lose a number
+        raise PolicyError(f"metadata: {key}.labels must be distinct")
     frame = _get(raw, f"{key}.frame", str)
     signal = Signal(name, Quantity(quantity), tuple(shape), low, high, tuple(labels), frame)
     if _get(raw, f"{key}.unit", str) != signal.unit:

@@ -123,7 +123,7 @@ TEXTS = (
     *("robot.name", "robot.urdf_sha256", "robot.end_effector", "created", "content_sha256"),
     *("goal.tolerances.0.name", "goal.tolerances.0.unit", "inputs.2.frame", "outputs.0.frame", "inputs.2.name"),
 )
-GROUPS, SINGLE_NUMBERS = ("checkpoint", "evaluation", "config", "versions"), ("control_rate", "goal.tolerances.0.value")
+GROUPS, SINGLE_NUMBERS = ("checkpoint", "evaluation", "config", "versions"), ("control_rate",)
 EMPTY = ("low", "high", "labels")  # of a signal without bounds, or whose numbers have no names
 RIGHT = [
     *((key, "x") for key in TEXTS),
@@ -314,3 +314,13 @@ def test_deep_nesting_is_refused(good, key, depth):
 
 def test_half_a_surrogate_in_a_name_makes_no_unprintable_message(good):
     refusal(changed(good, "robot.joints", ["a", "\ud800"]))
+
+
+def test_a_goal_that_is_said_by_name_loses_no_number(good):
+    assert "inputs.2.labels must be distinct" in refusal(changed(good, "inputs.2.labels", ["x", "x"]))
+
+
+def test_a_tolerance_that_is_met_everywhere_is_refused(good):
+    text = refusal(changed(good, "goal.tolerances.0.value", 0.54))
+    assert text == "metadata: goal.tolerances: one of more than 0.53 m is met everywhere"
+    Metadata.parse(changed(good, "goal.tolerances.0.unit", "rad"))  # of something else than the goal
