@@ -82,7 +82,9 @@ class CheckedPolicy:
         return command, memory
 
     def _split(self, answer: Any) -> tuple[np.ndarray, np.ndarray]:
-        command, memory = answer if len(self.nothing) else (answer, self.nothing)
+        if not len(self.nothing):
+            return np.asarray(answer, dtype=np.float64), self.nothing
+        command, memory = answer
         return np.asarray(command, dtype=np.float64), np.asarray(memory, dtype=np.float32)
 
     def _call(self, call: Callable[[], Any]) -> Any:

@@ -1,6 +1,7 @@
 """The controller: from joint states and goals to safe commands. No ROS; time is an argument."""
 
 import math
+import operator
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -327,7 +328,7 @@ class Controller:
         robot, config = self._robot, self.config
         try:
             error = self._asked.error(robot.turned, self._goal)
-            far = max(each / tolerance for each, tolerance in zip(error, self._tolerances, strict=True))
+            far = max(map(operator.truediv, error, self._tolerances))
             self._reached = far < (config.reached_hysteresis if self._reached else 1.0)
             if self._reached:
                 self._progress.restart()

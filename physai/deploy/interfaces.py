@@ -9,7 +9,7 @@ from physai.deploy.metadata import Metadata
 from physai.deploy.parameters import ControllerConfig
 from physai.signals import Quantity
 
-_ROUNDING = 1e-6  # rad; of a position of single precision within a turn
+_ROUNDING = 2e-6  # rad; of positions of single precision, within two turns
 
 
 class VelocityInterface:

@@ -10,7 +10,7 @@ from physai.errors import UserError
 
 LATE = 3.0  # control periods; an update that comes later stands still
 
-_ROOM = 1 + 1e-4  # positions of single precision make so much of a velocity
+_ROOM = 1 + 1e-6  # of single precision
 
 
 class VelocityLimits:
@@ -23,7 +23,7 @@ class VelocityLimits:
 
     def __init__(self, metadata: Metadata, config: ControllerConfig) -> None:
         lower, upper = metadata.position_limit.T
-        self._command = metadata.command_limit
+        self._command, self._range = metadata.command_limit, metadata.command_limit * _ROOM
         self._lower, self._upper = lower, upper
         self._inner_lower, self._inner_upper = lower + config.limit_margin, upper - config.limit_margin
         self._fault_lower, self._fault_upper = lower - config.limit_fault, upper + config.limit_fault
@@ -38,7 +38,8 @@ class VelocityLimits:
 
     def out_of_range(self, wanted: np.ndarray, rounding: float = 0.0) -> bool:
         """Whether this is more than the policy was trained to ask for, with room for ``rounding``, rad/s."""
-        return bool((np.abs(wanted) > self._command * _ROOM + rounding).any())
+        allowed = self._range + rounding if rounding else self._range
+        return bool((np.abs(wanted) > allowed).any())
 
     def scaled(self, velocity: np.ndarray) -> np.ndarray:
         """Return velocities [n], rad/s, slowed down to the largest that is allowed, in their direction."""
