@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 ARGS ?=
 
-.PHONY: help train demo test bench check format build clean
+.PHONY: help train demo test bench check format docs build clean
 help:  ## Show this help
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## (.*)/  make \1\t\2/'
 
@@ -25,9 +25,14 @@ $(VENV)/.installed-ros: $(VENV)/.installed
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[onnx,ros]'
 	@touch $@
 
+$(VENV)/.installed-docs: $(VENV)/.installed
+	@echo "==> Installing the tools for the documentation into $(VENV)"
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[docs,onnx,ros]'
+	@touch $@
+
 $(VENV)/.installed-dev: $(VENV)/.installed
 	@echo "==> Installing the tools for tests and benchmarks into $(VENV)"
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev,bench,joblib,mlflow,onnx,optuna,ray,ray-launcher,ros,submitit,wandb]'
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev,bench,docs,joblib,mlflow,onnx,optuna,ray,ray-launcher,ros,submitit,wandb]'
 	@touch $@
 
 train: $(VENV)/.installed  ## Train the two-link arm (ARGS="env=kuka_reacher seed=1" for more)
@@ -48,14 +53,19 @@ bench: $(VENV)/.installed-dev  ## Measure speed against bare PyBullet, rclpy and
 	@echo "==> Measuring (all of it takes an hour and a half; ARGS=--collection and the like choose a part)"
 	$(BIN)/python -m physai.bench $(ARGS)
 
-check: $(VENV)/.installed-dev  ## Check format, lint and types
+check: $(VENV)/.installed-dev  ## Check format, lint, types and the direction of imports
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/mypy
+	$(BIN)/lint-imports
 
 format: $(VENV)/.installed-dev  ## Format the code
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix .
+
+docs: $(VENV)/.installed-docs  ## Build the documentation's site into build/docs
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict $(ARGS)
+	@echo "==> The site: build/docs/index.html"
 
 build: $(VENV)/.installed-dev  ## Build a wheel and try it in an empty environment, from another folder
 	rm -rf dist build/wheel-test

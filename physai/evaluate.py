@@ -8,6 +8,7 @@ from omegaconf import DictConfig
 
 from physai import cli
 from physai.config import Config, Count, PackageName, Seed, validate
+from physai.files import write_atomically
 
 if TYPE_CHECKING:
     from physai.training.run import TrainedPolicy
@@ -48,7 +49,6 @@ def _check(node: DictConfig) -> None:
 
 
 def _evaluate(node: DictConfig, _: Path) -> None:
-    from physai.training import checkpoint
     from physai.training.run import FINAL_SEED, print_summary
 
     config = validate(EvaluateConfig, node)
@@ -63,7 +63,7 @@ def _evaluate(node: DictConfig, _: Path) -> None:
     }
     names = [policy.randomization.name] if config.env is None else [policy.config.env.name, policy.randomization.name]
     output = Path(config.run) / f"evaluation_{'_'.join(names)}.json"
-    checkpoint.write(output, json.dumps(summary, indent=2).encode())
+    write_atomically(output, json.dumps(summary, indent=2).encode())
     print_summary(summary, f"{config.run}: {config.checkpoint}, on {config.episodes:,} goals")
 
 

@@ -1,5 +1,6 @@
 """``python -m physai.export``: turn the policy of a run into files for robots (see ``--help``)."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -60,7 +61,7 @@ def _export(node: DictConfig, _: Path) -> None:
         export(run, str(config.checkpoint), config.formats, load_config(run, config.allow))
 
 
-def export(run_dir: Path, which: str, formats: list[str], config: "TrainConfig") -> None:
+def export(run_dir: Path, which: str, formats: Sequence[str], config: "TrainConfig") -> None:
     """Export a policy through the gate, and say what was checked and written."""
     from physai.artifact import FILES, export_policy
 

@@ -56,8 +56,10 @@ class _Training:
         from physai.training.agent import Agent
 
         self.close()
-        self._agent = Agent.build(_config(node))
-        script(make_deployable(self._agent.policy(), self._agent.env))  # what does not script could not be exported
+        config = _config(node)
+        self._agent = Agent.build(config)
+        if config.export:
+            script(make_deployable(self._agent.policy(), self._agent.env))  # what does not script cannot be exported
         if not self._keep:
             self.close()
 
@@ -120,8 +122,8 @@ def _first_difference(run: Any, wanted: Any, key: str = "") -> str | None:
 
 
 def _run(config: "TrainConfig", run_dir: Path, resume: bool, agent: "Agent | None" = None) -> None:
-    from physai.training.loop import Interrupted
     from physai.training.run import run_training
+    from physai.training.stopping import Interrupted
 
     complete = (run_dir / "summary.json").is_file()
     try:
@@ -138,12 +140,15 @@ def _export(config: "TrainConfig", run_dir: Path, complete: bool) -> None:
     from physai.artifact import FILES, onnx
     from physai.export import export
 
-    lacking = onnx.missing()
-    formats = ["torchscript"] if lacking else ["torchscript", "onnx"]
-    files = [*(FILES[name] for name in formats), f"{FILES['torchscript']}.sha256"]
+    lacking = onnx.missing() if "onnx" in config.export else []
+    formats = [name for name in config.export if not (name == "onnx" and lacking)]
+    files = [FILES[name] for name in formats]
+    if "torchscript" in formats:
+        files.append(f"{FILES['torchscript']}.sha256")
     if complete and all((run_dir / name).exists() for name in files):
         return
-    export(run_dir, "best", formats, config)
+    if formats:
+        export(run_dir, "best", formats, config)
     if lacking:
         print(f"No {FILES['onnx']}: it needs {', '.join(lacking)} (pip install 'physai[onnx]')")
 

@@ -1,8 +1,11 @@
-"""What tests share: one thread, and the environments that physai comes with."""
+"""What tests share: one thread, the environments that physai comes with, and runs that are made once."""
 
+import shutil
 import signal
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -12,6 +15,9 @@ from omegaconf import OmegaConf
 
 from physai.config import compose, conf_dir, validate
 from physai.envs.simulation import EnvConfig
+from physai.training.config import TrainConfig
+from physai.training.run import run_training
+from tests.training.small import SMALL, command
 
 # A shell that starts the tests in the background has them, and whatever they start, take no notice of Ctrl-C.
 signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -59,30 +65,62 @@ def any_env(request: pytest.FixtureRequest) -> EnvConfig:
 
 
 @pytest.fixture(scope="session")
-def exported_run(tmp_path_factory: pytest.TempPathFactory, worker_id: str) -> Path:
-    """A run of the reacher that reaches most goals, with policy.pt and policy.onnx; not to be written to."""
-    return _run_once(tmp_path_factory, worker_id, "exported_run", "total_frames=120_000")
+def once(tmp_path_factory: pytest.TempPathFactory, worker_id: str) -> Callable[[str, Callable[[Path], None]], Path]:
+    """Fill a folder once for all workers, and return it: ``once(name, fill)``; not to be written to afterwards."""
+    base = tmp_path_factory.getbasetemp()
+    shared = base if worker_id == "master" else base.parent
+
+    def once(name: str, fill: Callable[[Path], None]) -> Path:
+        folder, done = shared / name, shared / f"{name}.done"
+        with FileLock(shared / f"{name}.lock"):  # one of them works, the others wait
+            if not done.exists():
+                shutil.rmtree(folder, ignore_errors=True)  # of one that failed
+                folder.mkdir()
+                fill(folder)
+                done.touch()
+        return folder
+
+    return once
 
 
 @pytest.fixture(scope="session")
-def recurrent_run(tmp_path_factory: pytest.TempPathFactory, worker_id: str) -> Path:
+def exported_run(once: Callable[[str, Callable[[Path], None]], Path]) -> Path:
+    """A run of the reacher that reaches most goals, with policy.pt and policy.onnx; not to be written to."""
+    return once("exported_run", partial(_train_and_export, "total_frames=120_000"))
+
+
+@pytest.fixture(scope="session")
+def position_run(once: Callable[[str, Callable[[Path], None]], Path]) -> Path:
+    """The same, of an arm that is driven by joint positions."""
+    command = "env.robot.command=joint_position"
+    return once("position_run", partial(_train_and_export, command, "total_frames=100_000"))
+
+
+@pytest.fixture(scope="session")
+def recurrent_run(once: Callable[[str, Callable[[Path], None]], Path]) -> Path:
     """The same, of a policy that remembers."""
-    return _run_once(tmp_path_factory, worker_id, "recurrent_run", "policy=gru", "total_frames=80_000")
+    return once("recurrent_run", partial(_train_and_export, "policy=gru", "total_frames=80_000"))
 
 
-def _run_once(factory: pytest.TempPathFactory, worker_id: str, name: str, *overrides: str) -> Path:
-    from physai.artifact import export_policy  # most tests need no training, and wait for no import of it
-    from physai.training.config import TrainConfig
-    from physai.training.run import run_training
+def _train_and_export(*arguments: Any) -> None:
+    *overrides, run = arguments
+    node = compose("train", [*overrides, "evaluation.episodes=200"])
+    (run / ".hydra").mkdir()
+    (run / ".hydra" / "config.yaml").write_text(OmegaConf.to_yaml(node))
+    run_training(validate(TrainConfig, node), run)
+    from physai.artifact import export_policy  # it takes a second to import, which few tests need
 
-    base = factory.getbasetemp()
-    shared = base if worker_id == "master" else base.parent  # of all workers: one of them trains, the others wait
-    run = shared / name
-    with FileLock(shared / f"{name}.lock"):
-        if not (run / "policy.onnx").exists():
-            node = compose("train", [*overrides, "evaluation.episodes=200"])
-            (run / ".hydra").mkdir(parents=True)
-            (run / ".hydra" / "config.yaml").write_text(OmegaConf.to_yaml(node))
-            run_training(validate(TrainConfig, node), run)
-            export_policy(run, "best", ["torchscript", "onnx"])
-    return run
+    export_policy(run, "best", ["torchscript", "onnx"])
+
+
+@pytest.fixture(scope="session")
+def small_run(once: Callable[[str, Callable[[Path], None]], Path]) -> Path:
+    """A run as the command leaves it, and beside it what it printed, ``output.txt``; not to be written to."""
+    return once("small_run", _run_command) / "run"
+
+
+def _run_command(folder: Path) -> None:
+    process = command("train", *SMALL, "hydra.run.dir=run", cwd=folder)
+    output = process.communicate()[0]
+    assert process.returncode == 0, output
+    (folder / "output.txt").write_text(output)

@@ -85,7 +85,7 @@ def test_sb3_defaults_are_the_well_known_numbers():
         0.5,
     )
     assert (config.collector.num_envs, config.collector.frames_per_batch) == (4, 4 * 2048)
-    assert config.collector.here  # no batch is older than the policy
+    assert config.collector.in_process  # no batch is older than the policy
     assert algo["minibatch_size"] == 64
     assert algo["scheduler"] is None
     assert (config.total_frames, config.evaluation.every_frames, config.checkpoint.every_frames) == (

@@ -42,18 +42,17 @@ def test_there_is_an_example_of_everything(examples):
         "physai/tasks",
         "conf/robot",
         "conf/env",
-        "conf/task",
         "conf/algo",
     }
 
 
 @pytest.mark.slow
 def test_the_discovery_tests_pick_up_what_is_added(project):
-    added = "long_arm or long_reacher or hurry or reuse"
+    added = "long_arm or long_reacher or joint_reach or reuse"
     tests = ("tests/test_config.py", "tests/robots", "tests/tasks", "tests/physics")
     result = run(project, "-m", "pytest", "-vv", "-p", "no:cacheprovider", "-k", added, *tests)
     assert result.returncode == 0, result.stdout
-    for name in ("robot@env.robot=long_arm", "env=long_reacher", "task@env.task=hurry", "algo=reuse"):
+    for name in ("robot@env.robot=long_arm", "env=long_reacher", "env=joint_reach", "algo=reuse"):
         assert re.search(rf"test_every_choice_builds_and_collects\[{re.escape(name)}\] PASSED", result.stdout), name
     assert "test_kinematics.py" in result.stdout  # robots are also held against PyBullet
 
@@ -61,7 +60,7 @@ def test_the_discovery_tests_pick_up_what_is_added(project):
 @pytest.mark.slow
 def test_all_of_it_trains_together(project):
     tiny = ("total_frames=2048", "collector.num_envs=64", "evaluation.goals=8", "evaluation.episodes=8")
-    choice = ("algo=reuse", "env=long_reacher", "task@env.task=hurry")
+    choice = ("algo=reuse", "env=joint_reach", "robot@env.robot=long_arm")
     result = run(project, "-m", "physai.train", *choice, *tiny, "hydra.run.dir=run")
     assert result.returncode == 0, result.stdout + result.stderr
     assert (project / "run" / "policy.pt").is_file()

@@ -16,7 +16,7 @@ from physai.plotting import plot_runs
 from physai.training.config import TrainConfig
 from physai.training.run import TrainedPolicy, load_config, run_training
 from tests import malicious
-from tests.training.small import SMALL, command
+from tests.training.small import EXPORTED, SMALL, command
 
 TINY = (*SMALL, "total_frames=2048", "checkpoint.every_frames=1024", "evaluation.goals=4", "evaluation.episodes=4")
 
@@ -71,8 +71,7 @@ def test_forty_ways_to_run_code_and_more():
     assert len(malicious.EVALUATE) + len(malicious.RESUME) + len(malicious.PLOT) >= 40
 
 
-def test_the_same_folder_without_a_payload_is_read_resumed_and_drawn(run, monkeypatch):
-    monkeypatch.setattr(train, "_export", lambda *_: None)
+def test_the_same_folder_without_a_payload_is_read_resumed_and_drawn(run):
     evaluate(run)
     plot_runs([run], run / "training.png")
     train._resume(run, ["allow=[mypackage]", "seed=0"])
@@ -153,8 +152,7 @@ def test_a_package_that_is_allowed_is_no_bridge_to_others(own, name):
         load_config(own, ["mypackage"])
 
 
-def test_what_the_user_types_beside_resume_is_the_users_own(own, monkeypatch):
-    monkeypatch.setattr(train, "_export", lambda *_: None)
+def test_what_the_user_types_beside_resume_is_the_users_own(own):
     train._resume(own, ["env.task._target_=mypackage.Mine"])
     assert (own / "summary.json").is_file()
 
@@ -167,7 +165,7 @@ def test_what_the_user_types_must_be_what_the_run_folder_says(own, capsys):
 def test_a_run_of_ones_own_parts_is_judged_and_exported_where_it_was_trained(own, monkeypatch):
     exported = []
     monkeypatch.setattr(artifact, "export_policy", lambda *_, config: exported.append(config))
-    config = validate(TrainConfig, compose("train", [*TINY, "env.task._target_=mypackage.Mine"]))
+    config = validate(TrainConfig, compose("train", [*TINY, EXPORTED, "env.task._target_=mypackage.Mine"]))
     train._run(config, own, resume=True)
     assert (own / "summary.json").is_file()
     assert exported == [config]
@@ -252,17 +250,6 @@ def test_what_loads_starts_or_fetches_does_not(name):
 def test_a_pickle_for_hydra_is_not_read(run, monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", ["physai.train", "--experimental-rerun=evil.pkl"])
     assert "pickle" in refused(capsys, train.main)
-
-
-def test_a_write_never_follows_a_link(tmp_path):
-    from physai.training.checkpoint import write
-
-    (tmp_path / "other").write_text("untouched")
-    for name in ("file", ".file.tmp"):
-        (tmp_path / name).symlink_to(tmp_path / "other")
-    write(tmp_path / "file", b"new")
-    assert (tmp_path / "file").read_text() == "new"
-    assert (tmp_path / "other").read_text() == "untouched"
 
 
 def test_links_within_a_run_folder_stay(run):

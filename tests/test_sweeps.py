@@ -63,8 +63,8 @@ def test_joblib_runs_four_seeds_in_two_processes(tmp_path):
     assert sorted(finished(tmp_path / "sweep")) == ["0", "1", "2", "3"]
     assert [f"[{number}] " in output for number in range(4)] == [True] * 4
     assert output.index("[3] ") < output.index("differs by")
-    assert "Judging" not in output  # who prints at the same time as others does so to a file of its own
-    assert "Judging" in (tmp_path / "sweep" / "2" / "output.txt").read_text()
+    assert "Evaluating the best" not in output  # who prints at the same time as others does so to a file of its own
+    assert "Evaluating the best" in (tmp_path / "sweep" / "2" / "output.txt").read_text()
     assert (tmp_path / "sweep" / "training.png").is_file()
     hashes = {json.loads(summary)["weights_sha256"] for summary in finished(tmp_path / "sweep").values()}
     assert len(hashes) == 4

@@ -24,7 +24,7 @@ finally:
 AT_THE_FIRST_FRAME = """
 import os, sys
 from physai import train
-from physai.training import agent, loop
+from physai.training import agent, trainer
 
 built = []
 build = agent.Agent.build
@@ -35,7 +35,7 @@ def first_frame(*_):
     sys.stdout.flush()
     os._exit(0)
 
-loop._loop = first_frame
+trainer.Trainer.fit = first_frame
 train.main()
 """
 

@@ -15,8 +15,8 @@ from physai.deploy import Metadata, PolicyError, load_policy
 from physai.deploy.archive import content_sha256
 from physai.deploy.metadata import metadata_sha256
 from physai.deploy.policy import load_module
+from physai.files import write_atomically
 from physai.seeding import derive
-from physai.training.checkpoint import write
 from physai.training.config import TrainConfig
 from physai.training.run import TrainedPolicy, git_commit
 
@@ -111,7 +111,7 @@ def export_policy(
             gate.check_onnx(onnx.Runtime(final_onnx), policy, expected, states, tolerance)
             if onnx.read_metadata(final_onnx) != text:
                 raise gate.GateError("the metadata of the ONNX file is not that of the policy")
-            write(run_dir / FILES["onnx"], final_onnx)
+            write_atomically(run_dir / FILES["onnx"], final_onnx)
         if "torchscript" in formats:
             _publish(run_dir / FILES["torchscript"], final)
         return metadata
@@ -136,5 +136,5 @@ def _publish(path: Path, content: bytes) -> None:
     """Write a policy and its hash; a kill in between leaves a policy without a hash, never one with a wrong hash."""
     beside = path.with_name(f"{path.name}.sha256")
     beside.unlink(missing_ok=True)
-    write(path, content)
-    write(beside, f"{hashlib.sha256(content).hexdigest()}  {path.name}\n".encode())
+    write_atomically(path, content)
+    write_atomically(beside, f"{hashlib.sha256(content).hexdigest()}  {path.name}\n".encode())

@@ -36,17 +36,21 @@ def output_signals(simulation: Simulation, memory_size: int = 0) -> tuple[Signal
 
 
 class Pipeline(nn.Module):
-    """Kinematics, observation, frozen normalization, network and command; scriptable.
+    """What all policies have between sensors and command; its subclasses have a method ``act``, which scripts.
 
-    It shares no memory with what it was made from, and needs no gradients.
+    Kinematics, observation, frozen normalization, network and command. It shares no memory with what it was made from,
+    and needs no gradients.
 
     Args:
         observation: The task's observation module.
         normalizer: Normalizes an observation.
-        network: Maps what it sees, side by side, to actions in [-1, 1].
+        network: Makes actions of what it sees.
         seen: What the network sees, as places in ``VIEWS``, in order.
         command: From actions to commands.
+        signature: Names of the inputs; pipelines of one type have the same.
     """
+
+    __constants__ = ["signature"]  # noqa: RUF012  # which makes a type of its own of each
 
     def __init__(
         self,
@@ -55,6 +59,7 @@ class Pipeline(nn.Module):
         network: nn.Module,
         seen: list[int],
         command: JointCommand,
+        signature: str,
     ) -> None:
         super().__init__()
         self.observation = copy.deepcopy(observation)
@@ -62,6 +67,7 @@ class Pipeline(nn.Module):
         self.network = copy.deepcopy(network)
         self.command = copy.deepcopy(command)
         self.seen = seen
+        self.signature = signature
         self.requires_grad_(False)
         self.eval()
 
@@ -75,6 +81,10 @@ class Pipeline(nn.Module):
     def error(self, joint_position: Tensor, goal: Tensor) -> Tensor:
         """How far the robot is from its goal, one column a tolerance: [N, n] rad and [N, g] to [N, e]."""
         return self.observation.error(joint_position, goal)
+
+
+class FeedForwardPipeline(Pipeline):
+    """A pipeline whose ``network`` maps what it sees, side by side, to actions in [-1, 1]."""
 
     @torch.jit.export
     def act(self, joint_position: Tensor, joint_velocity: Tensor, goal: Tensor, last_command: Tensor) -> Tensor:
@@ -104,14 +114,15 @@ class DeployablePolicy(TensorDictModuleBase):
     """A pipeline that takes and gives what its signals declare.
 
     Args:
-        pipeline: What acts.
+        pipeline: What acts, a :class:`Pipeline`.
         inputs: Signals that it takes, in order.
         outputs: Signals that it gives, in order.
     """
 
-    def __init__(self, pipeline: Pipeline, inputs: Sequence[Signal], outputs: Sequence[Signal]) -> None:
+    def __init__(self, pipeline: Any, inputs: Sequence[Signal], outputs: Sequence[Signal]) -> None:
         super().__init__()
         self.pipeline = pipeline
+        self.eval()
         self.inputs, self.outputs = tuple(inputs), tuple(outputs)
         self.in_keys, self.out_keys = [signal.name for signal in inputs], [signal.name for signal in outputs]
         self.memory_size = self.outputs[-1].size if self.out_keys[-1] == NEW_MEMORY else 0
@@ -158,14 +169,16 @@ def make_deployable(actor: TensorDictModuleBase, env: TransformedRobotEnv) -> De
                 f"policy.actor.in_keys: a policy that sees '{key}' cannot be exported, for no robot can tell it; "
                 f"it can see {', '.join(VIEWS)}"
             )
-    pipeline = (RecurrentPipeline if memory_size else Pipeline)(
+    inputs, outputs = input_signals(simulation, memory_size), output_signals(simulation, memory_size)
+    pipeline = (RecurrentPipeline if memory_size else FeedForwardPipeline)(
         simulation.task.module,
-        env.normalization.normalizer,
+        env.normalizer,
         actor.deterministic(),
         [VIEWS.index(key) for key in keys],
         simulation.joint_command,
+        ", ".join(signal.name for signal in inputs),
     )
-    return DeployablePolicy(pipeline, input_signals(simulation, memory_size), output_signals(simulation, memory_size))
+    return DeployablePolicy(pipeline, inputs, outputs)
 
 
 def script(policy: DeployablePolicy) -> torch.jit.ScriptModule:
@@ -181,7 +194,8 @@ def script(policy: DeployablePolicy) -> torch.jit.ScriptModule:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", DeprecationWarning)
             scripted = torch.jit.script(policy.pipeline)
-            scripted.define(f"def forward(self, {inputs}) -> {answer}:\n    {call}\n")
+            if not hasattr(scripted, "forward"):  # of another policy of this type
+                scripted.define(f"def forward(self, {inputs}) -> {answer}:\n    {call}\n")
             return scripted
     except Exception as error:  # the compiler's errors have no base class of their own
         reason = " ".join(str(error).split())[:160]

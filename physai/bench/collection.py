@@ -18,6 +18,7 @@ from physai.physics.pybullet import APART, robots_per_world
 from physai.robots import RobotSpec
 from physai.training.agent import make_actor
 from physai.training.config import TrainConfig
+from physai.transforms import RunningStatistics
 
 ROBOTS = (1, 16, 64, 128, 256, 512, 1024)
 COLLECTORS = ("single", "async", "multi_sync", "multi_async", "ray")
@@ -82,7 +83,8 @@ def _collection(config: TrainConfig, robots: int, processes: int) -> Iterator[Ca
     sizes = {"num_envs": robots * processes, "frames_per_batch": frames, "processes": processes}
     size = config.collector.model_copy(update=sizes)
     make_robots = partial(make_env, config.env, config.randomization, config.normalization)
-    env = make_robots(size.robots_here, config.seed)
+    env = make_robots(size.envs_of_learner, config.seed)
+    statistics = RunningStatistics(env.normalizer, config.normalization.eps)
     total_frames = (1 + ROUNDS) * batches * frames
     actor, cpu = make_actor(config, env), torch.device("cpu")
     collector = make_collector(size, env, make_robots, actor, total_frames, config.seed, 0, cpu)
@@ -90,7 +92,7 @@ def _collection(config: TrainConfig, robots: int, processes: int) -> Iterator[Ca
 
     def collect() -> int:
         for _ in range(batches):
-            env.normalization.update(next(source).get("observation"))
+            statistics.update(next(source).get("observation"))
         return batches * frames
 
     try:

@@ -80,7 +80,7 @@ def _exported(run: Path) -> dict[str, Call]:
     eager = make_deployable(actor, env)
     policy = load_policy(run / FILES["torchscript"])
     runtime = onnx.Runtime((run / FILES["onnx"]).read_bytes())
-    inputs = [moment.get(key) for key in policy.metadata.inputs]
+    inputs = [moment.get(signal.name) for signal in policy.metadata.inputs]
     arrays = [value[0].numpy() for value in inputs]
     env.close()
     return {

@@ -129,12 +129,12 @@ def race_physai(config: TrainConfig, race: Race, judge: TransformedRobotEnv) -> 
 
     def learn() -> int:
         batch = next(batches)
-        agent.env.normalization.update(batch.get("observation"))
+        agent.statistics.update(batch.get("observation"))
         agent.algorithm.update(batch)
         return batch.numel()
 
     def success_rate() -> float:
-        judge.normalization.load_state_dict(agent.env.normalization.state_dict())
+        judge.normalizer.load_state_dict(agent.statistics.normalizer.state_dict())
         with _workers_at_rest():
             return evaluate(agent.actor, judge, GOALS, GOALS_SEED).success_rate
 

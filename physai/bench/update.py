@@ -38,7 +38,7 @@ def _update_speeds(seed: int, minibatch: int) -> list[float]:
     agent, twin = Agent.build(config), Agent.build(config)
     try:
         batch = next(iter(agent.collector))
-        agent.env.normalization.update(batch.get("observation"))
+        agent.statistics.update(batch.get("observation"))
         by_hand = plain_ppo(twin, batch, config.algo)
 
         def update() -> int:

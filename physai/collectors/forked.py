@@ -15,10 +15,10 @@ from tensordict.nn import TensorDictModuleBase
 from torch import multiprocessing
 from torchrl.collectors import MultiCollector, _runner
 
-from physai.collectors.worker import Acting, MakeEnv, WorkerCollector
+from physai.collectors.worker import MakeEnv, NormalizedPolicy, WorkerCollector
 from physai.envs.make import TransformedRobotEnv
 from physai.errors import UserError
-from physai.forked import follow, signals_wait
+from physai.processes import follow, signals_wait
 from physai.transforms.normalization import Normalizer
 
 
@@ -44,10 +44,12 @@ class RobotMultiCollector(MultiCollector):
         normalizer: Normalizer,
         **torchrl: Any,
     ) -> None:
-        self._acting = Acting(policy, normalizer)
-        self._copies = [self._acting.copy().share_memory() for _ in range(workers)]
+        self._policy_of_learner = NormalizedPolicy(policy, normalizer)
+        self._copies = [self._policy_of_learner.copy().share_memory() for _ in range(workers)]
         # The tensors themselves: load_state_dict would take half a millisecond of every batch.
-        self._weights, *self._weights_of = (list(one.state_dict().values()) for one in (self._acting, *self._copies))
+        self._weights, *self._weights_of = (
+            list(one.state_dict().values()) for one in (self._policy_of_learner, *self._copies)
+        )
         threads, method = torch.get_num_threads(), multiprocessing.get_start_method(allow_none=True)
         before = set(multiprocessing.active_children())
         # Forked workers start at once; fresh ones would import for seconds.

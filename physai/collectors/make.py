@@ -30,14 +30,14 @@ class CollectorConfig(Config):
     ray_init: dict[str, Any] | None
 
     @property
-    def here(self) -> bool:
+    def in_process(self) -> bool:
         """Whether the learner's process collects."""
         return self.processes == 1 and self.sync and self.ray_init is None
 
     @property
-    def robots_here(self) -> int:
+    def envs_of_learner(self) -> int:
         """How many robots the learner's own process needs: all, or one that shows what others are like."""
-        return self.num_envs if self.here else 1
+        return self.num_envs if self.in_process else 1
 
 
 def make_collector(
@@ -77,7 +77,7 @@ def make_collector(
         "total_frames": -(-total_frames // frames) * frames,
         "init_random_frames": -(-warmup_frames // frames) * frames,
     }
-    if config.here:
+    if config.in_process:
         cpu = torch.device("cpu")
         # Named devices are cast to at every step; where all is on the CPU, nothing needs to be.
         devices = {} if device == cpu else {"policy_device": device, "env_device": cpu, "storing_device": cpu}
@@ -89,7 +89,7 @@ def make_collector(
         torch.manual_seed(derive(seed, "exploration", worker))
         return make_env(robots // processes, derive(seed, "train", worker))
 
-    parts = processes, make_worker_env, policy, env.normalization.normalizer
+    parts = processes, make_worker_env, policy, env.normalizer
     if config.ray_init is not None:
         try:
             from physai.collectors.ray import RobotRayCollector  # it takes its time, and is there only if wanted

@@ -18,9 +18,10 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torchrl.collectors.distributed import RayCollector
 
-from physai.collectors.worker import Acting, MakeEnv, WorkerCollector
+from physai.collectors.worker import MakeEnv, NormalizedPolicy, WorkerCollector
 from physai.config import nearest
 from physai.errors import UserError
+from physai.processes import SIGNALS, kill_with_this
 from physai.transforms.normalization import Normalizer
 
 _START_SECONDS = 60  # for a cluster that may be busy
@@ -54,7 +55,7 @@ class RobotRayCollector(RayCollector):
         ray_init: dict[str, Any],
         **torchrl: Any,
     ) -> None:
-        self._acting = Acting(policy, normalizer)
+        self._policy_of_learner = NormalizedPolicy(policy, normalizer)
         self._ended = False
         self._watcher: subprocess.Popen[bytes] | None = None
         others = _descendants(os.getpid())
@@ -63,7 +64,7 @@ class RobotRayCollector(RayCollector):
             with _one_line():
                 super().__init__(
                     [partial(make_env, worker) for worker in range(workers)],
-                    self._acting.copy().policy,
+                    self._policy_of_learner.copy().policy,
                     sync=True,
                     collector_class=WorkerCollector,
                     collector_kwargs=[{"auto_register_policy_transforms": False} for _ in range(workers)],
@@ -81,14 +82,15 @@ class RobotRayCollector(RayCollector):
                         f"{ray.cluster_resources().get('CPU', 0):.0f}"
                     )
                 ray.get(ready)
-            self._watcher = _watch(_descendants(os.getpid()) - others)
+            if started := _descendants(os.getpid()) - others:
+                self._watcher = kill_with_this(started)  # most notice by themselves, two take a minute
         except BaseException:
             ray.shutdown()
             raise
 
     def update_policy_weights_(self, *_: Any, **__: Any) -> None:
         """Send the workers what to act with; TorchRL calls it before each batch."""
-        weights = ray.put({name: value.cpu() for name, value in self._acting.state_dict().items()})
+        weights = ray.put({name: value.cpu() for name, value in self._policy_of_learner.state_dict().items()})
         for collector in self.remote_collectors:
             collector.renew.remote(weights)
 
@@ -139,7 +141,7 @@ def _start_ray(arguments: dict[str, Any], workers: int) -> None:
     # Signals to a terminal or a container reach Ray's processes, too, which inherit that they wait: the learner says
     # what comes of them. It keeps its own handler: Ray sets one.
     handler = signal.getsignal(signal.SIGTERM)
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, _SIGNALS)
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
     try:
         ray.init(**arguments)
     except Exception as error:  # Ray asserts, too
@@ -149,17 +151,6 @@ def _start_ray(arguments: dict[str, Any], workers: int) -> None:
     finally:
         signal.signal(signal.SIGTERM, handler)
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
-
-
-_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)
-
-
-def _watch(started: set[int]) -> "subprocess.Popen[bytes] | None":
-    """Start what kills Ray's processes when the learner is killed: most notice by themselves, two take a minute."""
-    if not started:
-        return None
-    command = ["sh", "-c", f"read _; kill -9 {' '.join(map(str, started))} 2> /dev/null"]  # read ends with the learner
-    return subprocess.Popen(command, stdin=subprocess.PIPE, start_new_session=True)
 
 
 def _descendants(process: int) -> set[int]:

@@ -29,7 +29,7 @@ class RobotCollector(Collector):
 
     def rollout(self) -> TensorDictBase:
         """Collect one batch."""
-        self._carrier.set("normalized_observation", self.env.normalization.normalizer(self._carrier.get("observation")))
+        self._carrier.set("normalized_observation", self.env.normalizer(self._carrier.get("observation")))
         return super().rollout()
 
     def state(self) -> dict[str, Any]:

@@ -17,7 +17,7 @@ MakeEnv = Callable[[int], TransformedRobotEnv]
 """Builds the env of a worker from its number, in the worker's process."""
 
 
-class Acting(nn.Module):
+class NormalizedPolicy(nn.Module):
     """What decides how robots act: a policy, and the normalizer of what it sees.
 
     Each worker has a copy, which follows the learner's between two batches and never in the middle of one.
@@ -28,7 +28,7 @@ class Acting(nn.Module):
         self.policy = policy
         self.normalizer = normalizer
 
-    def copy(self) -> "Acting":
+    def copy(self) -> "NormalizedPolicy":
         """Return a copy on the CPU, where robots are."""
         return deepcopy(self).to("cpu")
 
@@ -43,8 +43,8 @@ class WorkerCollector(RobotCollector):
         return batch.set(("collector", "traj_ids"), torch.zeros(batch.shape, dtype=torch.int64))
 
     def renew(self, weights: dict[str, Tensor]) -> None:
-        """Act from now on as an :class:`Acting` does whose ``state_dict`` this is."""
-        Acting(self.policy, self.env.normalization.normalizer).load_state_dict(weights)
+        """Act from now on as an :class:`NormalizedPolicy` does whose ``state_dict`` this is."""
+        NormalizedPolicy(self.policy, self.env.normalizer).load_state_dict(weights)
 
     def state_dict(self) -> dict[str, Any]:
         """Return the state of the env and of this process' random numbers."""

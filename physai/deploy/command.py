@@ -11,10 +11,10 @@ class State(enum.Enum):
 
     WAITING = "waiting"  # for a joint state, a goal, or permission to move
     ACTIVE = "active"  # the policy drives
-    REACHED = "reached"  # zero velocity at the goal, until it moves or the arm drifts
-    HOLD = "hold"  # zero velocity, until enough good joint states have come in a row, or a new goal
-    FAULT = "fault"  # zero velocity, until reset
-    ESTOP = "estop"  # zero velocity, until reset
+    REACHED = "reached"  # stands at the goal, until it moves or the arm drifts
+    HOLD = "hold"  # stands still, until enough good joint states have come in a row, or a new goal
+    FAULT = "fault"  # stands still, until reset
+    ESTOP = "estop"  # stands still, until reset
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,12 +22,13 @@ class Command:
     """What to send to the arm.
 
     Attributes:
-        velocity: rad/s, in the order of the policy's joints; None: send nothing, the arm has not been heard of yet.
+        value: rad/s or rad, as the policy's command signal says, in the order of its joints; None: send nothing, the
+            arm has not been heard of yet.
         state: The controller's state.
         reasons: Why the arm stands or is held back, and what was refused; empty when the policy drives, within the
             limits of velocity and acceleration that always hold.
     """
 
-    velocity: np.ndarray | None
+    value: np.ndarray | None
     state: State
     reasons: tuple[str, ...]

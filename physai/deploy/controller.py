@@ -1,6 +1,7 @@
-"""The controller: from joint states and goals to safe velocity commands. No ROS; time is an argument."""
+"""The controller: from joint states and goals to safe commands. No ROS; time is an argument."""
 
 import math
+import operator
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -8,11 +9,14 @@ from typing import Any
 
 import numpy as np
 
+from physai.deploy.checked import AnswerError, CheckedPolicy
 from physai.deploy.command import Command, State
 from physai.deploy.following import Following, Progress, Strain
 from physai.deploy.goals import Goal, GoalError, accept
+from physai.deploy.interfaces import INTERFACES
 from physai.deploy.joints import Heard, JointReader, JointState, JointStateError
 from physai.deploy.limits import LATE, VelocityLimits, check
+from physai.deploy.metadata import GOAL, LAST_COMMAND, MEMORY
 from physai.deploy.parameters import ControllerConfig
 from physai.deploy.policy import Policy
 
@@ -24,8 +28,9 @@ _MOVED = 0.1  # tolerances; a goal that moves by less is still the same
 class Controller:
     """Drives one robot: call ``update`` at the policy's control rate, and send what it returns.
 
-    On any doubt it commands zero velocity: at once, whatever the acceleration limit. From a hold it recovers by
-    itself; from a fault and an emergency stop only by ``reset``, and a new goal.
+    On any doubt it lets the arm stand still, by zero velocities or by the positions where it is: at once, whatever the
+    acceleration limit. From a hold it recovers by itself; from a fault and an emergency stop only by ``reset``, and a
+    new goal.
 
     What a policy remembers begins with zeros, as its episodes did: at a new goal, and after every tick at which it did
     not drive.
@@ -36,7 +41,7 @@ class Controller:
         stopwatch: Measures how long the policy took, in s; no other decision depends on a clock.
 
     Raises:
-        UserError: If the limits do not fit the robot.
+        UserError: If the limits do not fit the robot, or the policy takes what this controller cannot tell it.
     """
 
     def __init__(
@@ -46,24 +51,25 @@ class Controller:
         stopwatch: Callable[[], float] = time.perf_counter,
     ) -> None:
         self.policy = policy
-        self._period = 1.0 / policy.metadata.control_rate
-        self._stopwatch = stopwatch
-        self._zeros = self._last = np.zeros(len(policy.metadata.joints))
+        metadata = policy.metadata
+        self._asked = CheckedPolicy(policy, stopwatch)
+        self._interface = INTERFACES[metadata.command.quantity](metadata)
+        self._period = 1.0 / metadata.control_rate
+        self._tolerances = [tolerance.value for tolerance in metadata.tolerances]
         self._counters: Counter[str] = Counter()
         self._latched: State | None = None
         self._latch_reason = ""
         config = config or ControllerConfig()
-        self._robot = JointReader(policy.metadata, config)
-        self._progress = Progress(policy.metadata.goal_tolerance)
-        self._strain = Strain(policy.metadata)
+        self._robot = JointReader(metadata, config)
+        self._progress = Progress()
+        self._strain = Strain(metadata)
         self.configure(config)
         self._now: float | None = None
         self._still = 0  # updates in a row at that time
         self._received = -math.inf  # when the robot was heard of: its joint that was not for longest
         self._goal: np.ndarray | None = None
         self._reached = False
-        self._nothing = np.zeros(policy.metadata.memory_size, np.float32)
-        self._memory = self._nothing
+        self._memory = self._asked.nothing
         self._step = 0.0  # s since the memory's last one
         self._needed = 0  # good joint states until a hold ends
         self._hold_reason = ""
@@ -82,9 +88,8 @@ class Controller:
         self.config = config
         self._robot.configure(config)
         self._limits = VelocityLimits(self.policy.metadata, config)
+        self._interface.configure(config, self._limits)
         self._following = Following(self.policy.metadata, config)
-        # A lower velocity holds at once, whatever the acceleration limit: the margin may be too narrow for another.
-        self._last = self._last * min(1.0, config.max_velocity / max(np.abs(self._last).max(), 1e-9))
         self._check_position()
 
     def update(
@@ -105,15 +110,15 @@ class Controller:
                 until there is none.
 
         Returns:
-            Velocities [n] in rad/s, or none before the first joint state; with state and reasons.
+            A command [n], or none before the first joint state; with state and reasons.
         """
         reasons: list[str] = []
         self._counters["updates"] += 1
-        elapsed, stop = self._take_time(now, reasons)
+        passed, stop = self._take_time(now, reasons)
         if goal is not None:
             self._take_goal(goal, reasons)
         if self._command.state is State.ACTIVE and not stop:
-            self._following.commanded(now, self._last)
+            self._following.commanded(now, self._interface.way(passed))
         else:
             self._following.restart()
         if joint_state is not None and math.isfinite(now):
@@ -124,21 +129,30 @@ class Controller:
             what = "joint state" if oldest is None else f"state of '{oldest}'"
             reasons.append(self._hold("state old", f"the last {what} is {now - self._received:.3f} s old"))
         state = self._state(interlocks, reasons)
-        velocity, memory = self._zeros, self._nothing
+        elapsed = min(passed, self._period)
+        velocity, memory = None, self._asked.nothing
         if state is State.ACTIVE:
             if not stop:
                 velocity, memory = self._drive(elapsed, reasons)
             state = State.HOLD if self._gave_up else State.REACHED if self._reached else State.ACTIVE
         if self._latched not in (None, state):  # an emergency stop while the policy was asked, or a policy that failed
-            velocity, memory, state = self._zeros, self._nothing, self._latched
+            velocity, memory, state = None, self._asked.nothing, self._latched
             reasons.append(self._latch_reason)
         if state is not self._command.state:
             self._since = self._now or 0.0
             self._counters[f"entered {state.value}"] += 1
-        self._last, self._memory = velocity, memory
-        unheard = state is State.WAITING and self._received == -math.inf
-        self._command = Command(None if unheard else velocity.copy(), state, tuple(reasons))
+        self._memory = memory
+        value = self._send(velocity, elapsed, reasons)
+        if value is not None:
+            unheard = state is State.WAITING and self._received == -math.inf
+            value = None if unheard else value.copy()
+        self._command = Command(value, state, tuple(reasons))
         return self._command
+
+    @property
+    def standstill(self) -> np.ndarray:
+        """The command [n] that stands still where the arm is now."""
+        return self._interface.standstill(self._robot.position)
 
     def emergency_stop(self) -> None:
         """Stop at once; only ``reset`` ends it."""
@@ -181,14 +195,14 @@ class Controller:
             "recovery_states_needed": self._needed,
             "last_hold": self._hold_reason,
             "goal": None if self._goal is None else self._goal.tolist(),
-            "velocity": None if self._command.velocity is None else self._command.velocity.tolist(),
+            "command": None if self._command.value is None else self._command.value.tolist(),
             "policy_failures_in_a_row": self._failures,
             "policy_sha256": self.policy.sha256,
             "counters": dict(self._counters),
         }
 
     def _take_time(self, now: float, reasons: list[str]) -> tuple[float, bool]:
-        """Return the time since the last update, at most a period, and whether this tick must be zero."""
+        """Return the time since the last update, and whether the arm must stand in this tick."""
         if not math.isfinite(now):
             reasons.append(self._hold("clock", "the time is not finite"))
             return 0.0, True
@@ -204,25 +218,24 @@ class Controller:
         if elapsed > LATE * self._period:
             self._counters["late updates"] += 1
             reasons.append(f"update came after {elapsed:.3f} s, {elapsed / self._period:.1f} periods")
-            return self._period, True
-        return min(elapsed, self._period), False
+            return elapsed, True
+        return elapsed, False
 
     def _take_goal(self, goal: Goal, reasons: list[str]) -> None:
         try:
-            new = accept(goal, self.policy.metadata, self.config.unreachable_goal == "project")
+            new, projected = accept(goal, self.policy.metadata, self.config.unreachable_goal == "project")
         except GoalError as rejected:
             self._counters[f"goals rejected: {rejected.kind}"] += 1
             reasons.append(str(rejected))
             return
         self._counters["goals"] += 1
-        if not np.array_equal(new, goal.position):
+        if projected:
             self._counters["goals projected"] += 1
             reasons.append(f"goal out of reach: {new.tolist()} is the nearest in reach")
-        tolerance = self.policy.metadata.goal_tolerance
-        if self._goal is None or np.abs(new - self._goal).max() > _MOVED * tolerance:
+        if self._goal is None or np.abs(new - self._goal).max() > _MOVED * self._tolerances[0]:
             self._reached, self._gave_up = False, ""
             self._progress.restart()
-            self._memory = self._nothing
+            self._memory = self._asked.nothing
         self._goal = new
 
     def _take_state(self, now: float, joint_state: JointState, timely: bool, reasons: list[str]) -> None:
@@ -309,54 +322,60 @@ class Controller:
             reasons.append("no goal yet")
         return State.WAITING if interlocks or self._goal is None else State.ACTIVE
 
-    def _drive(self, elapsed: float, reasons: list[str]) -> tuple[np.ndarray, np.ndarray]:
-        """Ask the policy, and limit what it wants; return the velocity, and what the policy remembers."""
+    def _drive(self, elapsed: float, reasons: list[str]) -> tuple[np.ndarray | None, np.ndarray]:
+        """Ask the policy, and limit what it wants; return the velocity, or None to stand, and the new memory."""
         assert self._goal is not None
-        robot, metadata = self._robot, self.policy.metadata
-        started = self._stopwatch()
+        robot, config = self._robot, self.config
         try:
-            distance = self.policy.distance(robot.turned, self._goal)
-            if not 0 <= distance < math.inf:
-                return self._policy_failed("distance", f"gave the distance {distance}", reasons)
-            self._reached = distance < metadata.goal_tolerance * (
-                self.config.reached_hysteresis if self._reached else 1
-            )
+            error = self._asked.error(robot.turned, self._goal)
+            far = max(map(operator.truediv, error, self._tolerances))
+            self._reached = far < (config.reached_hysteresis if self._reached else 1.0)
             if self._reached:
                 self._progress.restart()
-                return self._zeros, self._nothing
-            if self._progress.waited(distance, elapsed) > self.config.progress_timeout:
-                return self._give_up(distance, reasons)
-            wanted, memory = self._ask(robot.turned, robot.velocity, self._goal)
-        except Exception as error:  # a policy is a foreign program
-            return self._policy_failed("exception", f"raised {type(error).__name__}: {_last_line(error)}", reasons)
-        took = self._stopwatch() - started
-        if wanted.shape != self._zeros.shape:
-            return self._policy_failed("shape", f"gave the shape {list(wanted.shape)}", reasons)
-        if memory.shape != self._nothing.shape:
-            return self._policy_failed("shape", f"gave a memory of the shape {list(memory.shape)}", reasons)
-        if not np.isfinite(wanted).all():
-            return self._policy_failed("not finite", "gave a velocity that is not finite", reasons)
-        if not np.isfinite(memory).all():
-            return self._policy_failed("not finite", "gave a memory that is not finite", reasons)
-        if took > self.config.policy_timeout:
-            return self._policy_failed("slow", f"took {took * 1e3:.1f} ms", reasons)
+                return None, self._asked.nothing
+            if self._progress.waited(far, elapsed) > config.progress_timeout:
+                return self._give_up(error, reasons)
+            target = self._interface.begin(robot.position, robot.turned)
+            known = {
+                "joint_position": robot.turned,
+                "joint_velocity": robot.velocity,
+                GOAL: self._goal,
+                MEMORY: self._memory,
+                LAST_COMMAND: self._interface.last_command,
+            }
+            answer, memory = self._asked.answer(known, config.policy_timeout)
+        except AnswerError as failure:
+            return self._policy_failed(failure, reasons)
         self._failures = 0
-        if self._limits.out_of_range(wanted):
+        wanted = self._interface.wanted(answer)
+        if self._limits.out_of_range(wanted, self._interface.rounding):
             self._counters["commands clamped"] += 1
             reasons.append("the policy's command was beyond its range")
-        velocity, held_back = self._limits.apply(wanted, robot.position, self._last, elapsed)
+        velocity, held_back = self._limits.apply(wanted, robot.position, target, self._interface.velocity, elapsed)
         if held_back is not None:
             self._counters["ticks at a position limit"] += 1
             reasons.append(held_back)
         return velocity, self._remember(memory, elapsed)
 
-    def _give_up(self, distance: float, reasons: list[str]) -> tuple[np.ndarray, np.ndarray]:
+    def _send(self, velocity: np.ndarray | None, elapsed: float, reasons: list[str]) -> np.ndarray | None:
+        """Return what makes the robot go on with a velocity, or stand; None where that is not known yet."""
+        if velocity is None:
+            return self._interface.stand(self._robot.position)
+        value, waits = self._interface.drive(velocity, elapsed)
+        if waits is not None:
+            self._counters["ticks at max_lead"] += 1
+            reasons.append(waits)
+        return value
+
+    def _give_up(self, error: list[float], reasons: list[str]) -> tuple[None, np.ndarray]:
         self._counters["holds: no progress"] += 1
+        tolerances = self.policy.metadata.tolerances
+        far = ", ".join(f"{each:.3f} {tolerance.unit}" for each, tolerance in zip(error, tolerances, strict=True))
         self._gave_up = self._hold_reason = (
-            f"no progress for {self.config.progress_timeout:g} s, {distance:.3f} m from the goal: waiting for another"
+            f"no progress for {self.config.progress_timeout:g} s, {far} from the goal: waiting for another"
         )
         reasons.append(self._gave_up)
-        return self._zeros, self._nothing
+        return None, self._asked.nothing
 
     def _remember(self, memory: np.ndarray, elapsed: float) -> np.ndarray:
         """Return the new memory, or the old one: who asks more often than in training must not make time run faster."""
@@ -366,21 +385,10 @@ class Controller:
         self._step -= self._period
         return memory
 
-    def _ask(self, position: np.ndarray, velocity: np.ndarray, goal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        if not self.policy.metadata.memory_size:
-            return np.asarray(self.policy(position, velocity, goal), dtype=np.float64), self._nothing
-        wanted, memory = self.policy(position, velocity, goal, self._memory)
-        return np.asarray(wanted, dtype=np.float64), np.asarray(memory, dtype=np.float32)
-
-    def _policy_failed(self, kind: str, what: str, reasons: list[str]) -> tuple[np.ndarray, np.ndarray]:
-        self._counters[f"policy failures: {kind}"] += 1
+    def _policy_failed(self, failure: AnswerError, reasons: list[str]) -> tuple[None, np.ndarray]:
+        self._counters[f"policy failures: {failure.kind}"] += 1
         self._failures += 1
-        reasons.append(f"the policy {what}")
+        reasons.append(f"the policy {failure}")
         if self._failures >= self.config.policy_failures:
-            self._fault("policy", f"the policy failed {self._failures} times in a row; at last it {what}")
-        return self._zeros, self._nothing
-
-
-def _last_line(error: Exception) -> str:
-    """What went wrong; TorchScript's errors begin with a traceback."""
-    return (str(error).strip().splitlines() or ["no reason given"])[-1][:80]
+            self._fault("policy", f"the policy failed {self._failures} times in a row; at last it {failure}")
+        return None, self._asked.nothing

@@ -9,9 +9,10 @@ from physai.deploy.metadata import Metadata
 from physai.deploy.parameters import ControllerConfig
 
 # What healthy arms need, measured on simulated ones of randomization=strong (delays of 60 ms, gains of 0.3, encoder
-# noise of 5 mrad), and with 50 ms of delay more: README, "An arm that does not follow".
+# noise of 5 mrad), and with 50 ms of delay more: docs/faults.md, "An arm that does not follow".
 _DELAY = 0.16  # s; measured motion may be that of commands up to so much older
 _FLOOR = 0.015  # rad
+_PROGRESS = 0.1  # tolerances
 _DRAGGED = 0.5  # share of the fastest joint's motion that the others may be dragged along with, of following_error
 
 
@@ -71,8 +72,8 @@ class Following:
         self._rows, self._sample_at = 0, -math.inf  # of measurements, and when the last of them was taken
         self._commanded[:] = 0.0
 
-    def commanded(self, now: float, velocity: np.ndarray) -> None:
-        """Take velocities [n], rad/s, that were commanded until a time, s, since the last such time."""
+    def commanded(self, now: float, way: np.ndarray) -> None:
+        """Take how far each joint was told to go, [n] rad, until a time, s, since the last such time."""
         if not self._begun:
             self._begun = True
             self._start = self._at = now
@@ -81,9 +82,10 @@ class Following:
             return
         while (at := self._start + (self._told + 1) * self._period) <= now:
             self._told += 1
+            share = (at - self._at) / (now - self._at) if now > self._at else 1.0
             self._commanded[:-1] = self._commanded[1:]
-            self._commanded[-1] = self._path + velocity * (at - self._at)
-        self._path = self._path + velocity * (now - self._at)
+            self._commanded[-1] = self._path + way * share
+        self._path = self._path + way
         self._at = now
 
     def heard(self, received: float, motion: np.ndarray) -> Deviation | None:
@@ -151,14 +153,9 @@ class Following:
 
 
 class Progress:
-    """Whether the distance to a goal still falls.
+    """Whether the distance to a goal, in tolerances, still falls; a tenth of one counts as progress."""
 
-    Args:
-        tolerance: What counts as reached, in the distance's unit; a tenth of it counts as progress.
-    """
-
-    def __init__(self, tolerance: float) -> None:
-        self._step = 0.1 * tolerance
+    def __init__(self) -> None:
         self.restart()
 
     def restart(self) -> None:
@@ -167,7 +164,7 @@ class Progress:
 
     def waited(self, distance: float, elapsed: float) -> float:
         """Return for how long, s, the distance has not fallen, ``elapsed`` s after it was asked last."""
-        if distance < self._best - self._step:
+        if distance < self._best - _PROGRESS:
             self._best, self._waited = distance, 0.0
         else:
             self._waited += elapsed

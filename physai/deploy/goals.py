@@ -1,6 +1,5 @@
 """Goals from outside: which are taken, and which are not."""
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -8,51 +7,73 @@ import numpy as np
 
 from physai.deploy.joints import to_floats
 from physai.deploy.metadata import Metadata
+from physai.signals import Signal
 
 
 @dataclass(frozen=True)
 class Goal:
-    """Where the end effector shall go.
+    """What the robot shall do.
 
     Attributes:
-        position: x and y in the frame, m.
-        frame: Name of the frame.
+        value: Numbers, in the order of the policy's goal signal, or one for each of ``names``.
+        frame: Name of the frame of a goal that is a place; else empty.
+        names: What the numbers belong to, in any order, such as joints; empty where their order says it.
     """
 
-    position: Sequence[float]
-    frame: str
+    value: Sequence[float]
+    frame: str = ""
+    names: Sequence[str] = ()
 
 
 class GoalError(Exception):
     """A goal that cannot be taken: ``kind`` for counting, and a line for people."""
 
     def __init__(self, kind: str, message: str) -> None:
-        super().__init__(message)
+        super().__init__(f"goal rejected: {message}")
         self.kind = kind
 
 
-def accept(goal: Goal, metadata: Metadata, project: bool) -> np.ndarray:
-    """Return the goal's position [2], m, moved onto the ring of reachable goals if that is allowed.
+def accept(goal: Goal, metadata: Metadata, project: bool) -> tuple[np.ndarray, bool]:
+    """Return the goal's numbers in the signal's order, and whether they were moved into the region of goals.
 
     Raises:
-        GoalError: If it is not two finite numbers in the right frame, or out of reach.
+        GoalError: If it is not made of finite numbers, in another frame, or out of reach.
     """
-    position = to_floats(goal.position) if isinstance(goal, Goal) else None
-    if position is None:
-        raise GoalError("malformed", "goal rejected: it is not two numbers")
-    if position.shape != (2,):
-        raise GoalError("malformed", f"goal rejected: it has the shape {list(position.shape)}, not [2]")
-    radius = math.hypot(*position)
-    if not math.isfinite(radius):
-        raise GoalError("not finite", "goal rejected: it is not finite")
+    signal = metadata.goal
+    value = to_floats(goal.value) if isinstance(goal, Goal) else None
+    if value is None:
+        raise GoalError("malformed", "it is not made of numbers")
+    if len(names := _names(goal)):
+        value = _in_order(value, names, signal)
+    if value.shape != signal.shape:
+        raise GoalError("malformed", f"it has the shape {list(value.shape)}, not {list(signal.shape)}")
+    if not np.isfinite(value).all():
+        raise GoalError("not finite", "it is not finite")
     if not isinstance(goal.frame, str):
-        raise GoalError("malformed", "goal rejected: its frame is no name")
-    if goal.frame != metadata.goal_frame:
-        raise GoalError("wrong frame", f"goal rejected: frame '{goal.frame}' is not '{metadata.goal_frame}'")
-    inner, outer = metadata.goal_radius
-    # A goal on the very edge, written with fewer digits, is meant to be in.
-    if inner - 1e-6 <= radius <= outer + 1e-6:
-        return position
-    if project and radius > 1e-6:
-        return position * (min(max(radius, inner), outer) / radius)
-    raise GoalError("unreachable", f"goal rejected: {radius:.3f} m from the base, not {inner:g} to {outer:g} m")
+        raise GoalError("malformed", "its frame is no name")
+    if goal.frame != signal.frame and signal.frame:
+        raise GoalError("wrong frame", f"frame '{goal.frame}' is not '{signal.frame}'")
+    if metadata.region.contains(value):
+        return value, False
+    projected = metadata.region.project(value) if project else None
+    if projected is None:
+        raise GoalError("unreachable", metadata.region.describe(value))
+    return projected, True
+
+
+def _names(goal: Goal) -> tuple[str, ...]:
+    try:
+        names = tuple(goal.names)
+    except TypeError:
+        names = (None,)  # type: ignore[assignment]
+    if not all(isinstance(name, str) for name in names):
+        raise GoalError("malformed", "its names are none")
+    return names
+
+
+def _in_order(value: np.ndarray, names: tuple[str, ...], signal: Signal) -> np.ndarray:
+    if value.shape != (len(names),):
+        raise GoalError("malformed", f"{len(names)} names, but values of the shape {list(value.shape)}")
+    if sorted(names) != sorted(signal.labels):
+        raise GoalError("malformed", f"it is for {list(names)}, not {list(signal.labels)}")
+    return value[[names.index(label) for label in signal.labels]]

@@ -10,6 +10,8 @@ from physai.errors import UserError
 
 LATE = 3.0  # control periods; an update that comes later stands still
 
+_ROOM = 1 + 1e-6  # of single precision
+
 
 class VelocityLimits:
     """Limits on a vector of joint velocities.
@@ -21,7 +23,7 @@ class VelocityLimits:
 
     def __init__(self, metadata: Metadata, config: ControllerConfig) -> None:
         lower, upper = metadata.position_limit.T
-        self._command = metadata.command_limit
+        self._command, self._range = metadata.command_limit, metadata.command_limit * _ROOM
         self._lower, self._upper = lower, upper
         self._inner_lower, self._inner_upper = lower + config.limit_margin, upper - config.limit_margin
         self._fault_lower, self._fault_upper = lower - config.limit_fault, upper + config.limit_fault
@@ -34,18 +36,25 @@ class VelocityLimits:
         far = (position < self._fault_lower) | (position > self._fault_upper)
         return int(far.argmax()) if far.any() else None
 
-    def out_of_range(self, wanted: np.ndarray) -> bool:
-        """Whether this is more than the policy was trained to command (with room for rounding)."""
-        return bool((np.abs(wanted) > self._command * (1 + 1e-6)).any())
+    def out_of_range(self, wanted: np.ndarray, rounding: float = 0.0) -> bool:
+        """Whether this is more than the policy was trained to ask for, with room for ``rounding``, rad/s."""
+        allowed = self._range + rounding if rounding else self._range
+        return bool((np.abs(wanted) > allowed).any())
+
+    def scaled(self, velocity: np.ndarray) -> np.ndarray:
+        """Return velocities [n], rad/s, slowed down to the largest that is allowed, in their direction."""
+        largest = np.abs(velocity).max()
+        return velocity * (self._max_velocity / largest) if largest > self._max_velocity else velocity
 
     def apply(
-        self, wanted: np.ndarray, position: np.ndarray, last: np.ndarray, elapsed: float
+        self, wanted: np.ndarray, position: np.ndarray, target: np.ndarray, last: np.ndarray, elapsed: float
     ) -> tuple[np.ndarray, str | None]:
         """Return the velocities [n], rad/s, that may be commanded now; and what a position limit had to do with it.
 
         Args:
             wanted: What the policy wants, finite, rad/s.
             position: Where the joints are, rad.
+            target: Where they are told to be; the same where they are not told.
             last: What was commanded last, rad/s.
             elapsed: Time since then, s.
         """
@@ -56,8 +65,10 @@ class VelocityLimits:
         if largest > fastest:
             velocity = velocity * (fastest / largest)
         # Outward motion at a limit stops at once, what is wanted as what still goes on.
-        highest = np.where(position >= self._inner_upper, 0.0, np.inf)
-        lowest = np.where(position <= self._inner_lower, 0.0, -np.inf)
+        told = target is not position
+        most, least = (np.maximum(position, target), np.minimum(position, target)) if told else (position, position)
+        highest = np.where(most >= self._inner_upper, 0.0, np.inf)
+        lowest = np.where(least <= self._inner_lower, 0.0, -np.inf)
         inward = np.minimum(np.maximum(velocity, lowest), highest)
         going, last = last, np.minimum(np.maximum(last, lowest), highest)
         if reason is None and ((inward != velocity) | (going != last)).any():
@@ -69,6 +80,10 @@ class VelocityLimits:
         if beyond and (largest := np.abs(velocity).max()) > fastest:  # slow at once, however fast it was
             velocity = velocity * (fastest / largest)
         return velocity, reason
+
+    def room(self, position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Smallest and largest positions [n], rad, that may be commanded: the limits, or where a joint is beyond."""
+        return np.minimum(self._lower, position), np.maximum(self._upper, position)
 
 
 def smallest_margin(max_velocity: float, state_timeout: float, period: float) -> float:

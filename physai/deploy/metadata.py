@@ -3,31 +3,26 @@
 import hashlib
 import json
 import math
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
 
 from physai.errors import UserError
+from physai.signals import Quantity, Region, Signal, Tolerance
+from physai.signals.region import REGIONS
 
 FORMAT = "physai.policy"
-FORMAT_VERSION = 1
-INPUTS = ("joint_position", "joint_velocity", "goal")
-OUTPUT = "joint_velocity_command"
+FORMAT_VERSION = 2
+GOAL = "goal"
+LAST_COMMAND = "last_command"  # what was sent before: an input of policies that command positions
 MEMORY, NEW_MEMORY = "memory", "new_memory"  # of a policy that remembers: a further input, a further output
-DISTANCE = "distance"  # of the end effector to the goal, which the controller asks for
-UNITS = {
-    "joint_position": "rad",
-    "joint_velocity": "rad/s",
-    "goal": "m",
-    DISTANCE: "m",
-    OUTPUT: "rad/s",
-    "effort": "N m",
-}
+ERROR = "error"  # how far the robot is from a goal, which the controller asks for
 MAX_PAIRS = 1000
-MAX_MEMORY = 65536  # numbers
+MAX_SIZE = 65536  # numbers of a signal
+_COMMANDS = (Quantity.JOINT_VELOCITY, Quantity.JOINT_POSITION)
 # What a controller does not need, but people do.
-_TOLD = {
+_FOR_PEOPLE = {
     "robot.urdf_sha256": str,
     "robot.end_effector": str,
     "checkpoint": dict,
@@ -54,45 +49,51 @@ class Metadata:
         raw: The JSON object.
         robot: Name of the robot.
         joints: Names of the n joints, in the policy's order; the arrays below follow it.
+        home: Rest pose, rad, [n].
         position_limit: rad, [n, 2]; infinite for continuous joints.
         velocity_limit: rad/s, [n].
         effort_limit: N·m, [n].
-        command_limit: Largest velocity that the policy commands, rad/s, [n].
+        command_limit: How fast an action of 1 moves each joint, rad/s, [n].
         control_rate: Hz.
-        goal_frame: Link in whose frame goals are given.
-        goal_radius: Nearest and farthest goal from that frame's origin, m.
-        goal_tolerance: Distance that counts as reached, m.
-        memory_size: How many numbers the policy remembers from step to step, H; 0 for most. An episode begins with
-            zeros.
-        golden: Inputs, and the command and distance that the policy gave for them when it was exported; float32,
-            [pairs, n], [pairs, 2], [pairs, 1]; also the memory before and after, [pairs, H], if there is one.
+        inputs: What the policy takes, in order.
+        outputs: What it gives, in order; first the command.
+        region: Where goals lie.
+        tolerances: Errors that count as reached, one for each error that the policy tells.
+        golden: Inputs, and the outputs and errors that the policy gave for them when it was exported, by name; float32,
+            [pairs, ...].
         content_sha256: Hash of the code and weights that this describes.
     """
 
     raw: dict[str, Any]
     robot: str
     joints: tuple[str, ...]
+    home: np.ndarray
     position_limit: np.ndarray
     velocity_limit: np.ndarray
     effort_limit: np.ndarray
     command_limit: np.ndarray
     control_rate: float
-    goal_frame: str
-    goal_radius: tuple[float, float]
-    goal_tolerance: float
-    memory_size: int
+    inputs: tuple[Signal, ...]
+    outputs: tuple[Signal, ...]
+    region: Region
+    tolerances: tuple[Tolerance, ...]
     golden: dict[str, np.ndarray]
     content_sha256: str
 
     @property
-    def inputs(self) -> tuple[str, ...]:
-        """What the policy takes, in order."""
-        return input_keys(self.memory_size)
+    def goal(self) -> Signal:
+        """What is asked of the robot."""
+        return next(signal for signal in self.inputs if signal.name == GOAL)
 
     @property
-    def outputs(self) -> tuple[str, ...]:
-        """What it gives, in order."""
-        return output_keys(self.memory_size)
+    def command(self) -> Signal:
+        """What the robot is told."""
+        return self.outputs[0]
+
+    @property
+    def memory_size(self) -> int:
+        """How many numbers the policy remembers from step to step, H; an episode begins with zeros. 0 for most."""
+        return sum(signal.size for signal in self.outputs[1:])
 
     @classmethod
     def parse(cls, text: str) -> "Metadata":
@@ -119,38 +120,37 @@ class Metadata:
         position = _array(raw, "limits.position", (n, 2), infinite=True)
         if not (position[:, 0] < position[:, 1]).all():
             raise PolicyError("metadata: limits.position must be pairs of lower and upper limit")
-        inner, outer = _array(raw, "goal.radius", (2,))
-        if not 0 <= inner <= outer:
-            raise PolicyError("metadata: goal.radius must be an inner and an outer radius")
-        memory_size = _memory_size(raw)
-        sizes = {"joint_position": n, "joint_velocity": n, "goal": 2, OUTPUT: n, MEMORY: memory_size}
-        sizes[NEW_MEMORY] = memory_size
-        for side, keys in (("inputs", input_keys(memory_size)), ("outputs", output_keys(memory_size))):
-            if _get(raw, side, dict) != {key: ["N", sizes[key]] for key in keys}:
-                raise PolicyError(f"metadata: {side} must be {list(keys)}")
-        if _get(raw, "units", dict) != UNITS:
-            raise PolicyError(f"metadata: units must be {UNITS}")
-        for key, kind in _TOLD.items():
+        inputs, outputs = _signals(raw, "inputs"), _signals(raw, "outputs")
+        _check_signals(inputs, outputs, tuple(joints))
+        region, tolerances = _region(raw), _tolerances(raw)
+        goal = next(signal for signal in inputs if signal.name == GOAL)
+        most = float(np.abs(region.bounds).max())
+        if any(each.unit == goal.unit and each.value > most for each in tolerances):
+            raise PolicyError(f"metadata: goal.tolerances: one of more than {most:g} {goal.unit} is met everywhere")
+        if goal.shape != (size := len(region.bounds[0]),):
+            raise PolicyError(f"metadata: goal.region has {size} numbers, the goal has the shape {list(goal.shape)}")
+        for key, kind in _FOR_PEOPLE.items():
             _get(raw, key, kind)
-        pairs = len(_get(raw, f"golden.{OUTPUT}", list))
+        pairs = len(_get(raw, f"golden.{outputs[0].name}", list))
         if not 0 < pairs <= MAX_PAIRS:
             raise PolicyError(f"metadata: there are {pairs:,} golden pairs, not 1 to {MAX_PAIRS:,}")
-        sizes[DISTANCE] = 1
-        recorded = (*input_keys(memory_size), *output_keys(memory_size), DISTANCE)
+        shapes = {signal.name: (pairs, *signal.shape) for signal in (*inputs, *outputs)}
+        shapes[ERROR] = (pairs, len(tolerances))
         found = cls(
             raw=raw,
             robot=_get(raw, "robot.name", str),
             joints=tuple(joints),
+            home=_array(raw, "robot.home", (n,)),
             position_limit=position,
             velocity_limit=_positive(raw, "limits.velocity", (n,)),
             effort_limit=_positive(raw, "limits.effort", (n,)),
             command_limit=_positive(raw, "limits.command", (n,)),
             control_rate=float(_positive(raw, "control_rate", (), 1e4)),
-            goal_frame=_get(raw, "goal.frame", str),
-            goal_radius=(float(inner), float(outer)),
-            goal_tolerance=float(_positive(raw, "goal.tolerance", (), outer)),
-            memory_size=memory_size,
-            golden={key: _array(raw, f"golden.{key}", (pairs, sizes[key]), kind=np.float32) for key in recorded},
+            inputs=inputs,
+            outputs=outputs,
+            region=region,
+            tolerances=tolerances,
+            golden={key: _array(raw, f"golden.{key}", shape, kind=np.float32) for key, shape in shapes.items()},
             content_sha256=_get(raw, "content_sha256", str),
         )
         if not (found.command_limit <= found.velocity_limit).all():
@@ -160,14 +160,23 @@ class Metadata:
         return found
 
 
-def input_keys(memory_size: int) -> tuple[str, ...]:
-    """What a policy takes, in order."""
-    return (*INPUTS, MEMORY) if memory_size else INPUTS
+def describe_signal(signal: Signal) -> dict[str, Any]:
+    """Return a signal as JSON holds it; null stands for a bound that does not exist."""
+    bounds = {key: [x if math.isfinite(x) else None for x in getattr(signal, key)] for key in ("low", "high")}
+    return {
+        **asdict(signal),
+        **bounds,
+        "quantity": signal.quantity.value,
+        "unit": signal.unit,
+        "shape": list(signal.shape),
+        "labels": list(signal.labels),
+    }
 
 
-def output_keys(memory_size: int) -> tuple[str, ...]:
-    """What a policy gives, in order."""
-    return (OUTPUT, NEW_MEMORY) if memory_size else (OUTPUT,)
+def describe_region(region: Region) -> dict[str, Any]:
+    """Return a region as JSON holds it."""
+    values = vars(region).items()
+    return {"kind": region.kind} | {key: list(v) if isinstance(v, tuple) else v for key, v in values}
 
 
 def metadata_sha256(raw: dict[str, Any]) -> str:
@@ -179,25 +188,126 @@ def metadata_sha256(raw: dict[str, Any]) -> str:
 def _get(raw: dict[str, Any], key: str, kind: type) -> Any:
     value: Any = raw
     for part in key.split("."):
-        if not isinstance(value, dict) or part not in value:
+        if isinstance(value, list) and part.isdigit():
+            value = value[int(part)]
+        elif isinstance(value, dict) and part in value:
+            value = value[part]
+        else:
             raise PolicyError(f"metadata: {key} is missing")
-        value = value[part]
     if not isinstance(value, kind):
         raise PolicyError(f"metadata: {key} must be a {kind.__name__}")
     return value
 
 
-def _memory_size(raw: dict[str, Any]) -> int:
-    if MEMORY not in _get(raw, "inputs", dict):
-        return 0
-    match raw["inputs"][MEMORY]:
-        case ["N", int(size)] if 0 < size <= MAX_MEMORY and size is not True:
-            return size
-    raise PolicyError(f"metadata: inputs.{MEMORY} must be ['N', H], H at most {MAX_MEMORY:,}")
+def _signals(raw: dict[str, Any], side: str) -> tuple[Signal, ...]:
+    listed = _get(raw, side, list)
+    if not 0 < len(listed) <= 32:
+        raise PolicyError(f"metadata: {side} must be a list of signals")
+    return tuple(_signal(raw, f"{side}.{number}") for number in range(len(listed)))
+
+
+def _signal(raw: dict[str, Any], key: str) -> Signal:
+    name, quantity = _get(raw, f"{key}.name", str), _get(raw, f"{key}.quantity", str)
+    if not name.isidentifier() or len(name) > 100:
+        raise PolicyError(f"metadata: {key}.name must be an identifier, not {name!r:.80}")
+    if quantity not in [known.value for known in Quantity]:
+        raise PolicyError(f"metadata: {key}.quantity: this physai does not know {quantity!r:.80}")
+    shape = _get(raw, f"{key}.shape", list)
+    if not shape or len(shape) > 8 or not all(type(length) is int and 0 < length <= MAX_SIZE for length in shape):
+        raise PolicyError(f"metadata: {key}.shape must be positive integers")
+    size = math.prod(shape)
+    if size > MAX_SIZE:
+        raise PolicyError(f"metadata: {key} has {size:,} numbers, more than {MAX_SIZE:,}")
+    low, high = (
+        _bounds(raw, f"{key}.{end}", size, stands_for) for end, stands_for in (("low", -math.inf), ("high", math.inf))
+    )
+    labels = _get(raw, f"{key}.labels", list)
+    if len(labels) not in (0, size) or not all(isinstance(label, str) for label in labels):
+        raise PolicyError(f"metadata: {key}.labels must be {size} names, or none")
+    if len(set(labels)) != len(labels):  # a goal that is said by name would lose a number
+        raise PolicyError(f"metadata: {key}.labels must be distinct")
+    frame = _get(raw, f"{key}.frame", str)
+    signal = Signal(name, Quantity(quantity), tuple(shape), low, high, tuple(labels), frame)
+    if _get(raw, f"{key}.unit", str) != signal.unit:
+        raise PolicyError(f"metadata: {key}.unit must be '{signal.unit}'")
+    if not (signal.bounds[0] <= signal.bounds[1]).all():
+        raise PolicyError(f"metadata: {key}.low must not be above {key}.high")
+    return signal
+
+
+def _bounds(raw: dict[str, Any], key: str, size: int, infinite: float) -> tuple[float, ...]:
+    listed = _get(raw, key, list)
+    if not listed:
+        return ()
+    values = _array(raw, key, (size,), nothing=infinite)
+    return tuple(values.tolist())
+
+
+def _check_signals(inputs: tuple[Signal, ...], outputs: tuple[Signal, ...], joints: tuple[str, ...]) -> None:
+    """See that a robot's policy takes and gives what a robot's policy must."""
+    names = [signal.name for signal in (*inputs, *outputs)]
+    if len(set(names)) != len(names) or ERROR in names:
+        raise PolicyError("metadata: the names of inputs and outputs must be distinct")
+    command, *memory = outputs
+    if command.quantity not in _COMMANDS or command.name != f"{command.quantity.value}_command":
+        raise PolicyError("metadata: the first of outputs must be a command of joint velocities or positions")
+    wanted: dict[str, Quantity | None] = {"joint_position": Quantity.JOINT_POSITION, GOAL: None}
+    wanted["joint_velocity"] = Quantity.JOINT_VELOCITY
+    if command.quantity is Quantity.JOINT_POSITION:
+        wanted[LAST_COMMAND] = Quantity.JOINT_POSITION
+    by_name = {signal.name: signal for signal in inputs}
+    for name, quantity in wanted.items():
+        if name not in by_name or quantity not in (None, by_name[name].quantity):
+            raise PolicyError(f"metadata: inputs must hold '{name}'" + (f", a {quantity.value}" if quantity else ""))
+    for signal in (command, *(by_name[name] for name, quantity in wanted.items() if quantity)):
+        if signal.shape != (len(joints),) or signal.labels != joints:
+            side = "outputs" if signal is command else "inputs"
+            raise PolicyError(f"metadata: {side}: '{signal.name}' must have one number for each of {list(joints)}")
+    sizes = [one.size for one in (*memory, *(signal for signal in inputs if signal.name == MEMORY))]
+    if memory and not ([one.name for one in memory] == [NEW_MEMORY] and len(sizes) == 2 and sizes[0] == sizes[1]):
+        raise PolicyError(f"metadata: a policy that remembers takes '{MEMORY}' and gives as much '{NEW_MEMORY}'")
+    if not memory and sizes:
+        raise PolicyError(f"metadata: there is '{MEMORY}' among the inputs, and no '{NEW_MEMORY}' among the outputs")
+
+
+def _region(raw: dict[str, Any]) -> Region:
+    told = dict(_get(raw, "goal.region", dict))
+    kind = told.pop("kind", None)
+    if not isinstance(kind, str) or kind not in REGIONS:
+        raise PolicyError(f"metadata: goal.region.kind: this physai does not know {kind!r:.80}")
+    if len(told) > 16 or not all(_all_numbers(value) and value is not None for value in told.values()):
+        raise PolicyError("metadata: goal.region must hold numbers")
+    try:
+        with np.errstate(over="ignore"):
+            fields: dict[str, Any] = {
+                key: tuple(map(float, v)) if isinstance(v, list) else float(v) for key, v in told.items()
+            }
+        return REGIONS[kind](**fields)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise PolicyError(f"metadata: goal.region: {' '.join(str(error).split())[:120]}") from None
+
+
+def _tolerances(raw: dict[str, Any]) -> tuple[Tolerance, ...]:
+    listed = _get(raw, "goal.tolerances", list)
+    if not 0 < len(listed) <= 1000:
+        raise PolicyError("metadata: goal.tolerances must be a list of tolerances")
+    return tuple(
+        Tolerance(
+            _get(raw, f"goal.tolerances.{number}.name", str),
+            _get(raw, f"goal.tolerances.{number}.unit", str),
+            float(_positive(raw, f"goal.tolerances.{number}.value", ())),
+        )
+        for number in range(len(listed))
+    )
 
 
 def _array(
-    raw: dict[str, Any], key: str, shape: tuple[int, ...], infinite: bool = False, kind: type = np.float64
+    raw: dict[str, Any],
+    key: str,
+    shape: tuple[int, ...],
+    infinite: bool = False,
+    kind: type = np.float64,
+    nothing: float | None = None,
 ) -> np.ndarray:
     value = _get(raw, key, object)
     try:
@@ -211,6 +321,8 @@ def _array(
         raise PolicyError(f"metadata: {key} must have the shape {list(shape)}, not {list(array.shape)}")
     if infinite:  # JSON has no infinity: null stands for a limit that does not exist
         array = np.where(np.isnan(array), np.array([-math.inf, math.inf]), array)
+    elif nothing is not None:
+        array = np.where(np.isnan(array), nothing, array)
     elif not np.isfinite(array).all():
         raise PolicyError(f"metadata: {key} must be finite")
     return array

@@ -87,6 +87,9 @@ class ControllerConfig(Parameters):
     limit_margin: float = parameter(0.1, "no motion further into a position limit within this", "rad", 1e-3, 1.0)
     limit_velocity: float = parameter(0.05, "fastest joint while one is beyond its limit", "rad/s", 1e-3, 100.0)
     limit_fault: float = parameter(0.2, "farther than this beyond a position limit is a fault", "rad", 0.0, 10.0)
+    max_lead: float = parameter(
+        0.25, "a position command is at most this far from where its joint is", "rad", 1e-3, 3.0
+    )
     state_timeout: float = parameter(0.1, "a joint state older than this stops the arm", "s", 1e-3, 10.0)
     resume_timeout: float = parameter(
         1.0, "a robot silent for longer is not driven on to its old goal", "s", 1e-3, 3600.0

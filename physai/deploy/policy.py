@@ -6,13 +6,13 @@ import os
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, overload
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 
 from physai.deploy import archive
-from physai.deploy.metadata import DISTANCE, INPUTS, OUTPUT, Metadata, PolicyError
+from physai.deploy.metadata import ERROR, GOAL, Metadata, PolicyError
 
 if TYPE_CHECKING:
     from tensordict.nn import TensorDictModule
@@ -20,20 +20,19 @@ if TYPE_CHECKING:
 Vector = Sequence[float] | np.ndarray
 
 # Golden pairs are equal to the last bit where the processor is the one that recorded them; others round differently.
-GOLDEN_TOLERANCE = 1e-4  # rad/s and m
+GOLDEN_TOLERANCE = 1e-4  # in the unit of each signal
 
 
 class Policy:
-    """From what one robot senses to its joint velocities; of :func:`load_policy`. Not for several threads at once.
+    """From what one robot senses to its command; of :func:`load_policy`. Not for several threads at once.
 
     A policy that remembers keeps nothing itself: it takes a memory, and gives the memory for the next call.
 
     Attributes:
         metadata: What the file says about itself.
         sha256: Hash of the file.
-        golden_error: Largest difference to the recorded commands on this machine, rad/s; 0.0 if all bits agree.
-        module: The TorchScript module, for batches: float32 tensors [N, n], [N, n], [N, 2] to [N, n]; of a policy that
-            remembers, also [N, H] to [N, H].
+        golden_error: Largest difference to the recorded answers on this machine; 0.0 if all bits agree.
+        module: The TorchScript module, for batches: float32 tensors [N, ...] of its inputs to those of its outputs.
     """
 
     def __init__(self, module: torch.jit.ScriptModule, metadata: Metadata, sha256: str) -> None:
@@ -41,54 +40,45 @@ class Policy:
         self.metadata = metadata
         self.sha256 = sha256
         self.golden_error = 0.0
-        n = len(metadata.joints)
         # Each array shares its memory with the tensor beside it: filling it is cheaper than making tensors.
-        arrays = [np.zeros((1, size), np.float32) for size in (n, n, 2, metadata.memory_size)]
-        self._position, self._velocity, self._goal, self._memory = arrays
-        self._tensors = [torch.from_numpy(array) for array in arrays[: len(metadata.inputs)]]
+        self._arrays = [np.zeros((1, *signal.shape), np.float32) for signal in metadata.inputs]
+        self._tensors = [torch.from_numpy(array) for array in self._arrays]
+        names = [signal.name for signal in metadata.inputs]
+        self._position, self._goal = names.index("joint_position"), names.index(GOAL)
+        self._remembers = metadata.memory_size > 0
 
-    @overload
-    def __call__(self, joint_position: Vector, joint_velocity: Vector, goal: Vector) -> np.ndarray: ...
-
-    @overload
-    def __call__(
-        self, joint_position: Vector, joint_velocity: Vector, goal: Vector, memory: Vector
-    ) -> tuple[np.ndarray, np.ndarray]: ...
-
-    def __call__(
-        self, joint_position: Vector, joint_velocity: Vector, goal: Vector, memory: Vector | None = None
-    ) -> np.ndarray | tuple[np.ndarray, np.ndarray]:
-        """Map positions [n] rad, velocities [n] rad/s and a goal [2] m to velocity commands [n], rad/s, float32.
+    def __call__(self, *inputs: Vector) -> Any:
+        """Map the inputs that ``metadata.inputs`` declares, in that order, to the command [n], float32.
 
         A policy that remembers also takes a memory [H], zeros where an episode begins, and gives the new one, [H].
 
         Raises:
             ValueError: If one of them has another length, or is missing.
         """
-        _fill(self._position, joint_position)
-        _fill(self._velocity, joint_velocity)
-        _fill(self._goal, goal)
-        if memory is None and not self.metadata.memory_size:
-            return self.module(*self._tensors)[0].numpy()
-        _fill(self._memory, () if memory is None else memory)
-        command, new_memory = self.module(*self._tensors)
-        return command[0].numpy(), new_memory[0].numpy()
+        if len(inputs) != len(self._arrays):
+            raise ValueError(f"{len(self._arrays)} inputs are needed, not {len(inputs)}")
+        for array, values in zip(self._arrays, inputs, strict=True):
+            _fill(array, values)
+        answer = self.module(*self._tensors)
+        return tuple(one[0].numpy() for one in answer) if self._remembers else answer[0].numpy()
 
-    def distance(self, joint_position: Vector, goal: Vector) -> float:
-        """Distance of the end effector to a goal [2] m at joint positions [n] rad, in m.
+    def error(self, joint_position: Vector, goal: Vector) -> np.ndarray:
+        """How far the robot is from a goal at joint positions [n] rad, one error for each tolerance, [e].
 
         Raises:
             ValueError: If one of them has another length.
         """
-        _fill(self._position, joint_position)
-        _fill(self._goal, goal)
-        return float(self.module.distance(self._tensors[0], self._tensors[2]))
+        _fill(self._arrays[self._position], joint_position)
+        _fill(self._arrays[self._goal], goal)
+        return self.module.error(self._tensors[self._position], self._tensors[self._goal])[0].numpy()
 
     def as_tensordict_module(self) -> "TensorDictModule":
         """Wrap the module for TorchRL code, with its keys; needs tensordict."""
         from tensordict.nn import TensorDictModule
 
-        return TensorDictModule(self.module, in_keys=list(self.metadata.inputs), out_keys=list(self.metadata.outputs))
+        sides = (self.metadata.inputs, self.metadata.outputs)
+        in_keys, out_keys = ([signal.name for signal in side] for side in sides)
+        return TensorDictModule(self.module, in_keys=in_keys, out_keys=out_keys)
 
 
 def _fill(row: np.ndarray, values: Vector) -> None:
@@ -139,7 +129,8 @@ def load_policy(path: str | Path, sha256: str | None = None, expect_joints: Sequ
         how = "with its joints in another order" if set(joints) == set(metadata.joints) else "for other joints"
         raise PolicyError(f"{path}: a policy {how}: {list(metadata.joints)}, not {list(joints)}")
     try:
-        policy = Policy(load_module(checked.content, metadata.inputs), metadata, digest)
+        inputs = [signal.name for signal in metadata.inputs]
+        policy = Policy(load_module(checked.content, inputs), metadata, digest)
         policy.golden_error = _golden_error(policy)
     except PolicyError as error:
         raise PolicyError(f"{path}: {error}") from None
@@ -166,7 +157,7 @@ def _described(path: Path, checked: archive.Archive) -> Metadata:
     return metadata
 
 
-def load_module(content: bytes, inputs: Sequence[str] = INPUTS) -> torch.jit.ScriptModule:
+def load_module(content: bytes, inputs: Sequence[str]) -> torch.jit.ScriptModule:
     """Load the TorchScript of a policy file that has been checked, or that is not written yet.
 
     Args:
@@ -180,14 +171,14 @@ def load_module(content: bytes, inputs: Sequence[str] = INPUTS) -> torch.jit.Scr
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)  # of TorchScript
         module = torch.jit.load(io.BytesIO(content), map_location="cpu").eval()
-        for method, arguments in (("forward", inputs), ("distance", ("joint_position", "goal"))):
+        for method, arguments in (("forward", inputs), (ERROR, ("joint_position", GOAL))):
             found = [a.name for a in getattr(module, method).schema.arguments[1:]] if hasattr(module, method) else None
             if found != list(arguments):
                 raise PolicyError(f"its {method} takes {found}, not {list(arguments)}")
         held = sorted(v.untyped_storage().nbytes() for v in module.state_dict().values())
         if held != sorted(archive.tensor_sizes(content)):
             raise PolicyError("its weights are shorter or longer than it says")
-        return torch.jit.freeze(module, preserved_attrs=["distance"])
+        return torch.jit.freeze(module, preserved_attrs=[ERROR])
 
 
 def _golden_error(policy: Policy) -> float:
@@ -195,22 +186,22 @@ def _golden_error(policy: Policy) -> float:
     golden, metadata, worst = policy.metadata.golden, policy.metadata, 0.0
     pairs = [dict(zip(golden, values, strict=True)) for values in zip(*golden.values(), strict=True)]
     for pair in pairs * 3:
-        inputs = [pair[key] for key in metadata.inputs]
+        inputs = [pair[signal.name] for signal in metadata.inputs]
         answer = policy(*inputs)
-        for key, found in zip(metadata.outputs, answer if metadata.memory_size else (answer,), strict=True):
+        answers = answer if metadata.memory_size else (answer,)
+        found = {signal.name: one for signal, one in zip(metadata.outputs, answers, strict=True)}
+        found[ERROR] = policy.error(pair["joint_position"], pair[GOAL])
+        for key, given in found.items():
             expected = pair[key]
-            if found.shape != expected.shape or found.dtype != np.float32:
-                raise PolicyError(f"it gives {found.dtype} {list(found.shape)}, not float32 {list(expected.shape)}")
-            error = float(np.abs(found - expected).max())
+            if given.shape != expected.shape or given.dtype != np.float32:
+                raise PolicyError(f"it gives {given.dtype} {list(given.shape)}, not float32 {list(expected.shape)}")
+            error = float(np.abs(given - expected).max())
             if not error <= GOLDEN_TOLERANCE:  # also where it is NaN
                 raise PolicyError(
-                    f"a golden pair differs by {error:.3g}{' rad/s' if key == OUTPUT else f' in {key}'}: at "
-                    f"{_shown(*inputs)} it gives {_shown(found)}, and gave {_shown(expected)} when it was exported"
+                    f"the {key} of a golden pair differs by {error:.3g}: at {_shown(*inputs)} it gives "
+                    f"{_shown(given)}, and gave {_shown(expected)} when it was exported"
                 )
             worst = max(worst, error)
-        gap = abs(policy.distance(pair["joint_position"], pair["goal"]) - pair[DISTANCE][0])
-        if not gap <= GOLDEN_TOLERANCE:
-            raise PolicyError(f"the distance of a golden pair differs by {gap:.3g} m")
     return worst
 
 

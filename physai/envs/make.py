@@ -16,6 +16,7 @@ from physai.seeding import derive
 from physai.transforms import (
     DomainRandomization,
     Memory,
+    Normalizer,
     Observation,
     ObservationNormalization,
     SensorModel,
@@ -39,8 +40,13 @@ class TransformedRobotEnv(TransformedEnv):
         return self.base_env.simulation
 
     @property
+    def normalizer(self) -> Normalizer:
+        """What normalizes observations."""
+        return self.normalization.normalizer
+
+    @property
     def normalization(self) -> ObservationNormalization:
-        """The transform that holds the statistics."""
+        """The transform that holds it."""
         return next(t for t in self.transform if isinstance(t, ObservationNormalization))
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -121,7 +127,7 @@ def make_env(
     transforms.append(Observation(base.simulation.task.module))
     made = TransformedRobotEnv(base, Compose(*transforms))
     size = made.observation_spec["observation"].shape[-1]
-    made.append_transform(ObservationNormalization(size, normalization.eps, normalization.clip))
+    made.append_transform(ObservationNormalization(Normalizer(size, normalization.clip)))
     if memory_size:
         made.append_transform(Memory(memory_size, num_envs))
     made.set_seed(seed)

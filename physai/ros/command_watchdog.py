@@ -1,10 +1,10 @@
-"""A relay before a controller that has no timeout: when commands stop, it goes on with zeros.
+"""A relay before a controller that has no timeout: when commands stop, it stops the arm.
 
-The inference node (with -p watchdog:=/command_watchdog) publishes to ~/commands; this node passes commands on. It sends
-zeros when none has come for a while, and, until ~/reset, when another publisher has commanded the controller: one that
-does not publish ~/commands, too. It listens only while a controller listens to it, so that who commands it knows. It
-publishes ~/heartbeat while it can hear them, so that who commands it can stop the arm when it hangs or dies. Run it on
-the robot's side of whatever may fail.
+The inference node (with -p watchdog:=/command_watchdog) publishes to ~/commands; this node passes commands on. It stops
+the arm when none has come for a while, and, until ~/reset, when another publisher has commanded the controller, one
+that does not publish ~/commands, too. It listens only while a controller listens to it, so that who commands it knows.
+It publishes ~/heartbeat while it can hear them, so that who commands it can stop the arm when it hangs or dies. Run it
+on the robot's side of whatever may fail.
 """
 
 import math
@@ -19,9 +19,10 @@ from std_srvs.srv import Trigger
 
 from physai.deploy.parameters import Parameters, parameter
 from physai.ros import qos
-from physai.ros.commands import VelocityCommands
+from physai.ros.commands import JointCommands, topic
 from physai.ros.parameters import declare
 from physai.ros.run import StoppableNode, run
+from physai.signals import Quantity
 
 
 @dataclass(frozen=True)
@@ -29,9 +30,15 @@ class WatchdogConfig(Parameters):
     """Parameters of the watchdog."""
 
     timeout: float = parameter(0.1, "without a command for this long, the arm stops", "s", 0.01, 10.0)
-    rate_hz: float = parameter(50.0, "zeros per second, and heartbeats", "Hz", 1.0, 1000.0, fixed=True)
+    rate_hz: float = parameter(50.0, "stops per second, and heartbeats", "Hz", 1.0, 1000.0, fixed=True)
     joints: int = parameter(
         0, "velocities in a command: zeros come from the start; 0: from the first command on", "", 0, 1000, fixed=True
+    )
+    command: str = parameter(
+        "joint_velocity",
+        "what commands are; an arm is stopped by zero velocities, or by the positions that it was sent to last",
+        choices=("joint_velocity", "joint_position"),
+        fixed=True,
     )
 
 
@@ -43,8 +50,9 @@ class CommandWatchdog(StoppableNode):
         self._config = config = declare(self, WatchdogConfig, self._configure)
         # Before the commands: who hears of these knows then that they are ours.
         self._heartbeat = self.create_publisher(Empty, "~/heartbeat", qos.COMMAND, event_callbacks=qos.SILENT_PUBLISHER)
-        self._commands = VelocityCommands(self, config.joints, partners="~/commands")
+        self._commands = JointCommands(self, config.joints, topic(Quantity(config.command)), partners="~/commands")
         self._joints = config.joints
+        self._positions, self._passed = config.command == Quantity.JOINT_POSITION, False
         self._source: Subscription | None = None
         self._last = -math.inf
         self._looked = time.monotonic()
@@ -61,20 +69,22 @@ class CommandWatchdog(StoppableNode):
 
     def _relay(self, message: Float64MultiArray, info: dict[str, int]) -> None:
         self._look()
-        velocity = message.data.tolist()
-        sound = len(velocity) > 0 and all(map(math.isfinite, velocity))
+        command = message.data.tolist()
+        sound = len(command) > 0 and all(map(math.isfinite, command))
         if not self._joints and sound:
-            self._joints = len(velocity)
+            self._joints = len(command)
             self._commands.resize(self._joints)
         if time.monotonic() < self._deaf_until:
             return
         self._last = qos.received_at(info)
         if self._conflict:
             self._stop(self._conflict)
-        elif not sound or len(velocity) != self._joints:
-            self._stop(f"{velocity} is no command for {self._joints} joints")
+        elif not sound or len(command) != self._joints:
+            self._stop(f"{command} is no command for {self._joints} joints")
         else:
-            self._commands.send(velocity)
+            self._commands.send(command)
+            if self._positions:
+                self._commands.still, self._passed = command, True
             if self._reason:
                 self.get_logger().info("passing commands on again")
             self._reason = ""
@@ -116,17 +126,22 @@ class CommandWatchdog(StoppableNode):
         response.success, response.message = not self._conflict, self._conflict
         return response
 
+    @property
+    def _can_stop(self) -> bool:
+        """Whether it is known what stands still: positions only once some have been passed on."""
+        return self._passed if self._positions else self._joints > 0
+
     def _stop(self, reason: str) -> None:
-        if not self._joints:
+        if not self._can_stop:
             return
         self._commands.stop()
         if reason != self._reason:
-            self.get_logger().error(f"zero velocity: {reason}")
+            self.get_logger().error(f"{'held' if self._positions else 'zero velocity'}: {reason}")
         self._reason = reason
 
     def finish(self) -> None:
-        """See that the last command that the robot got is zero."""
-        if self._joints:
+        """See that the last command that the robot got stands still."""
+        if self._can_stop:
             self._commands.finish()
 
 

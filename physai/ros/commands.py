@@ -1,4 +1,4 @@
-"""Velocity commands to a controller: is it there, is it ours alone, and do they end with zero."""
+"""Joint commands to a controller: is it there, is it ours alone, and do they end with one that stands still."""
 
 import math
 import time
@@ -11,29 +11,35 @@ from std_msgs.msg import Float64MultiArray
 
 from physai.ros import qos
 from physai.ros.companions import Companions
+from physai.signals import Quantity
 
-TOPIC = "/joint_velocity_controller/commands"
-_LAST_ZEROS, _PERIOD = 5, 0.02  # s
+_LAST, _PERIOD = 5, 0.02  # s
 _ACKNOWLEDGED = 0.5  # s
 
 
-class VelocityCommands:
-    """Publishes std_msgs/Float64MultiArray, rad/s, to a ros2_control velocity controller.
+def topic(quantity: Quantity) -> str:
+    """Where ros2_control's controller of joint velocities or positions takes commands."""
+    return f"/{quantity.value}_controller/commands"
+
+
+class JointCommands:
+    """Publishes std_msgs/Float64MultiArray, rad/s or rad, to a controller of ros2_control.
 
     Args:
         node: Whose remaps hold.
-        joints: How many velocities a command has.
+        joints: How many numbers a command has.
         topic: Where to.
         partners: Who publishes this other topic may publish here, too; empty if nobody may.
 
     Attributes:
         timeout: A way to the controller that was silent for longer is lost, s; of use where it tells that it lives.
         silences: How often it was lost.
+        still: The command that stands still: zero velocities, or positions that whoever commands keeps up to date.
     """
 
     timeout, silences = math.inf, 0
 
-    def __init__(self, node: Node, joints: int, topic: str = TOPIC, partners: str = "") -> None:
+    def __init__(self, node: Node, joints: int, topic: str, partners: str = "") -> None:
         self._publisher = node.create_publisher(
             Float64MultiArray, topic, qos.COMMAND, event_callbacks=qos.SILENT_PUBLISHER
         )
@@ -43,8 +49,9 @@ class VelocityCommands:
         self.resize(joints)
 
     def resize(self, joints: int) -> None:
-        """Take another number of velocities in a command."""
+        """Take another number of joints in a command."""
         self._message.data = array("d", [0.0] * joints)
+        self.still: Sequence[float] = [0.0] * joints
 
     @property
     def rival(self) -> str | None:
@@ -61,19 +68,19 @@ class VelocityCommands:
         """That no controller listens, or None."""
         return None if self._publisher.get_subscription_count() else f"no controller listens to {self.topic}"
 
-    def send(self, velocity: Sequence[float]) -> None:
+    def send(self, command: Sequence[float]) -> None:
         """Publish a command."""
-        for index, value in enumerate(velocity):
+        for index, value in enumerate(command):
             self._message.data[index] = value
         self._publisher.publish(self._message)
 
     def stop(self) -> None:
-        """Publish zeros."""
-        self.send([0.0] * len(self._message.data))
+        """Publish the command that stands still."""
+        self.send(self.still)
 
     def finish(self) -> None:
-        """Publish zeros until they have surely arrived: a reliable writer of depth 1 forgets what it has replaced."""
-        for _ in range(_LAST_ZEROS):
+        """Stop until this has surely arrived: a reliable writer of depth 1 forgets what it has replaced."""
+        for _ in range(_LAST):
             self.stop()
             time.sleep(_PERIOD)
         self.wait()

@@ -1,5 +1,6 @@
 """``python -m physai.ros.demo``: an exported policy drives the virtual robot over ROS 2 (see ``--help``)."""
 
+import json
 import os
 import signal
 import sys
@@ -8,7 +9,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
-import numpy as np
+import torch
 from omegaconf import DictConfig
 from rich.console import Console
 
@@ -55,12 +56,13 @@ class DemoConfig(Config):
         return Path(self.output) if self.output else self.path().with_name("demo.png")
 
 
-def sample_goals(metadata: Metadata, count: int, seed: int) -> np.ndarray:
-    """Draw goals [count, 2], m, on the ring that the policy was trained on."""
-    draw = np.random.default_rng(seed).random((2, count))
-    inner, outer = metadata.goal_radius
-    radius, angle = inner + (outer - inner) * draw[0], 2 * np.pi * draw[1]
-    return np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
+def robot_overrides(metadata: Metadata) -> list[str]:
+    """What makes the virtual robot the one that the policy was trained on: Hydra overrides of its env."""
+    robot = metadata.raw["config"]["env"]["robot"]
+    changed = ("joints", "end_effector", "home", "command", "command_limit", "position_gain")
+    return [f"env.robot.{key}={json.dumps(robot[key])}" for key in changed] + [
+        f"env.start.spread={json.dumps([0.0] * len(robot['joints']))}"
+    ]
 
 
 def _check(node: DictConfig) -> None:
@@ -77,9 +79,9 @@ def _check(node: DictConfig) -> None:
 
 def _demo(node: DictConfig, _: Path) -> None:
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"  # no robot but ours shall hear of this
-    from physai.ros.picture import draw_tour
+    from physai.ros.goal_client import GoalClient
+    from physai.ros.picture import draw_drive
     from physai.ros.processes import NodeProcess
-    from physai.ros.tour import Tourist
 
     config = validate(DemoConfig, node)
     path = config.path()
@@ -88,11 +90,16 @@ def _demo(node: DictConfig, _: Path) -> None:
     console.print(f"{path} drives a virtual {policy.metadata.robot} (randomization={config.robot})")
     with ExitStack() as stack:
         logs = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="physai-demo-")))
-        tourist = stack.enter_context(Tourist(policy))
-        tourist.check_alone()
+        client = stack.enter_context(GoalClient(policy))
+        client.check_alone()
         env = policy.metadata.raw["config"]["env"]["name"]
         robot = NodeProcess(
-            "physai.ros.virtual_robot", logs / "robot", env=env, randomization=config.robot, seed=config.seed
+            "physai.ros.virtual_robot",
+            logs / "robot",
+            env=env,
+            overrides=robot_overrides(policy.metadata),
+            randomization=config.robot,
+            seed=config.seed,
         )
         inference = NodeProcess(
             "physai.ros.inference_node",
@@ -109,19 +116,19 @@ def _demo(node: DictConfig, _: Path) -> None:
         )
         for process in (robot, inference):
             stack.enter_context(process)
-        tourist.watch = (robot, inference)
-        tourist.wait_until_ready()
+        client.watch = (robot, inference)
+        client.wait_until_ready()
         console.print("virtual_robot and inference_node work; sending goals")
-        goals = sample_goals(policy.metadata, config.goals, config.seed)
+        goals = policy.metadata.region.sample(config.goals, torch.Generator().manual_seed(config.seed))
         for number, goal in enumerate(goals, 1):
-            visit = tourist.visit(goal, config.hold)
-            console.print(f"  {number:>3}  {visit.describe()}", highlight=False)
+            result = client.send(goal, config.hold)
+            console.print(f"  {number:>3}  {result.describe()}", highlight=False)
     output = config.picture()
     try:
-        draw_tour(tourist.tour, policy.metadata, output)
+        draw_drive(client.record, policy, output)
     except (OSError, ValueError) as error:
         raise UserError(f"cannot write {output}: {error}") from None
-    kept = sum(visit.kept for visit in tourist.tour.visits)
+    kept = sum(result.kept for result in client.record.results)
     console.print(f"{kept} of {len(goals)} goals reached, and held for {config.hold:g} s. The path: {output}")
     if kept < len(goals):
         sys.exit(1)

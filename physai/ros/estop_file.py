@@ -5,6 +5,8 @@ import threading
 import time
 from pathlib import Path
 
+from physai.files import sync_folder
+
 _CREATED = 0.01  # s that a stop may wait for its file, behind the zeros
 _RETRY = 1.0  # s
 
@@ -96,7 +98,7 @@ class EmergencyStopFile:
         else:
             self.path.unlink(missing_ok=True)
             self._notice(False)
-        _sync(self.path.parent)
+        sync_folder(self.path.parent)
 
     def _notice(self, there: bool) -> None:
         with self._changed:
@@ -121,17 +123,9 @@ def _try(path: Path) -> None:
             file.write("whether an emergency stop could be remembered\n")
             file.flush()
             os.fsync(file.fileno())
-        _sync(path.parent)
+        sync_folder(path.parent)
     finally:
         path.unlink(missing_ok=True)
-
-
-def _sync(folder: Path) -> None:
-    opened = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(opened)
-    finally:
-        os.close(opened)
 
 
 def _why(error: Exception, path: Path) -> str:

@@ -11,7 +11,7 @@ class RosReacherEnv(RobotGymEnv):
     Args:
         env: A file of ``conf/env``.
         render_mode: See :class:`physai.envs.gym_env.RobotGymEnv`.
-        overrides: Hydra overrides such as ``env.max_velocity=0.5``.
+        overrides: Hydra overrides such as ``env.task.max_steps=100``.
 
     Raises:
         UserError: If there is no robot, or somebody else commands it.

@@ -1,11 +1,12 @@
-"""The node that drives a robot: joint states and goals in, joint velocities out, 50 times a second."""
+"""The node that drives a robot: joint states and goals in, joint commands out, 50 times a second."""
 
 import sys
 import time
 from dataclasses import dataclass
+from typing import Any
 
+import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import PointStamped
 from rclpy.clock import Clock, ClockType
 from rclpy.exceptions import NameValidationException
 from std_msgs.msg import Bool, String
@@ -15,8 +16,8 @@ from physai.deploy import Command, Controller, ControllerConfig, Goal, Policy, S
 from physai.deploy.goals import GoalError, accept
 from physai.deploy.parameters import parameter
 from physai.errors import UserError
-from physai.ros import outlet, qos
-from physai.ros.commands import VelocityCommands
+from physai.ros import goals, outlet, qos
+from physai.ros.commands import JointCommands, topic
 from physai.ros.diagnostics import Timing, diagnose
 from physai.ros.emergency_stop import TOPIC as EMERGENCY_STOP
 from physai.ros.emergency_stop import EmergencyStopTopic
@@ -25,6 +26,7 @@ from physai.ros.joint_states import JointStates
 from physai.ros.parameters import declare
 from physai.ros.run import StoppableNode, brief, run
 from physai.ros.watched_commands import WatchedCommands
+from physai.signals import Quantity
 
 # Nodes without our settings of Fast DDS may be found only by its second heartbeat: 2.9 s were measured. And when a
 # controller returns, an emergency stop or another node that commands may be found after it.
@@ -46,7 +48,7 @@ class InferenceConfig(ControllerConfig):
     trigger: str = parameter("timer", "what a command answers to", choices=("timer", "joint_state"), fixed=True)
     autostart: bool = parameter(False, "drive without waiting for ~/enable", fixed=True)
     goal: tuple[float, ...] = parameter(
-        (), "x and y of a goal to start with, in the policy's frame; empty: none", "m", -100.0, 100.0, fixed=True
+        (), "a goal to start with, in the policy's unit, order and frame; empty: none", "", -100.0, 100.0, fixed=True
     )
     watchdog: str = parameter(
         "", "the command_watchdog that passes commands on, such as /command_watchdog; empty: none", fixed=True
@@ -55,7 +57,7 @@ class InferenceConfig(ControllerConfig):
 
 
 class InferenceNode(StoppableNode):
-    """A thin shell of ROS around :class:`physai.deploy.Controller`; the README lists its topics and services.
+    """A thin shell of ROS around :class:`physai.deploy.Controller`; docs/ros2.md lists its topics and services.
 
     Raises:
         UserError: If a parameter or the policy file is wrong.
@@ -82,13 +84,15 @@ class InferenceNode(StoppableNode):
         self._timing = Timing()
         joints = config.joints or policy.metadata.joints
         self._index = [joints.index(joint) for joint in policy.metadata.joints]
-        self._velocity = [0.0] * len(joints)
+        self._sent = [0.0] * len(joints)
+        self._moving = False
+        self._takes_positions = policy.metadata.command.quantity is Quantity.JOINT_POSITION
 
-        self._commands = _commands(self, len(joints), config)
+        self._commands = _commands(self, len(joints), topic(policy.metadata.command.quantity), config)
         self._states = self.create_publisher(String, "~/state", qos.LATCHED)
         self._estopped = self.create_publisher(Bool, "~/estopped", qos.LATCHED)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
-        self.create_subscription(PointStamped, "~/goal", self._take_goal, 1)
+        self.create_subscription(goals.goal_type(policy.metadata.goal), "~/goal", self._take_goal, 1)
         self._stop_topic = EmergencyStopTopic(self, lambda: self._emergency_stop(f"by {EMERGENCY_STOP}"))
         self.create_service(SetBool, "~/enable", self._enable)
         self.create_service(Trigger, "~/estop", self._estop)
@@ -127,14 +131,14 @@ class InferenceNode(StoppableNode):
             self._timing.tick(time.monotonic())
             self._tick()
 
-    def _take_goal(self, message: PointStamped) -> None:
-        self._goal = Goal([message.point.x, message.point.y], message.header.frame_id)
+    def _take_goal(self, message: Any) -> None:
+        self._goal = goals.from_message(message, self._controller.policy.metadata.goal)
 
     def _enable(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
         if not request.data:
             self._enabled, self._disabled = False, "not enabled"
             self._tick()
-            response.success, response.message = True, "disabled: zero velocity"
+            response.success, response.message = True, "disabled: the arm stands"
             return response
         permitted, self._enabled = self._enabled, True
         obstacles = self._interlocks(time.monotonic())
@@ -194,7 +198,7 @@ class InferenceNode(StoppableNode):
         self._forget_old_goal(now)
         before, self._command = self._command, command
         if goal is not None:
-            self.get_logger().info(f"goal ({goal.position[0]:g}, {goal.position[1]:g}) m, in '{goal.frame}'")
+            self.get_logger().info(f"goal {goals.describe(goal, self._controller.policy.metadata.goal)}")
         for reason in command.reasons:
             if reason.startswith("goal"):
                 self.get_logger().warning(reason)
@@ -241,13 +245,20 @@ class InferenceNode(StoppableNode):
 
     def _publish(self, command: Command) -> None:
         # A disabled node does not disturb another one, once it stands still, and unless there is an emergency.
-        stands = self._contested and not self._enabled and not any(self._velocity)
+        stands = self._contested and not self._enabled and not self._moving
         silent = stands and command.state is not State.ESTOP
-        if command.velocity is None or silent or not self._publishing:
+        if command.value is None or silent or not self._publishing:
             return
-        for index, velocity in zip(self._index, command.velocity.tolist(), strict=True):
-            self._velocity[index] = velocity
-        self._commands.send(self._velocity)
+        if self._takes_positions:
+            self._commands.still = self._in_order(self._controller.standstill)
+        self._commands.send(self._in_order(command.value))
+        self._moving = command.state is State.ACTIVE
+
+    def _in_order(self, values: np.ndarray) -> list[float]:
+        """Values of the policy's joints, in the controller's order; other joints stand still."""
+        for index, value in zip(self._index, values.tolist(), strict=True):
+            self._sent[index] = value
+        return self._sent.copy()
 
     def _announce(self) -> None:
         command = self._command
@@ -280,17 +291,17 @@ class InferenceNode(StoppableNode):
         self._diagnostics.publish(diagnose(self.get_name(), now, self._controller.policy, values))
 
     def finish(self) -> None:
-        """See that the last command that the robot got is zero."""
+        """See that the last command that the robot got stands still."""
         if self._publishing:
             self._commands.finish()
         self._stop_file.close(_DISK)
 
 
-def _commands(node: InferenceNode, joints: int, config: InferenceConfig) -> VelocityCommands:
+def _commands(node: InferenceNode, joints: int, topic: str, config: InferenceConfig) -> JointCommands:
     if not config.watchdog:
-        return VelocityCommands(node, joints)
+        return JointCommands(node, joints, topic)
     try:
-        return WatchedCommands(node, joints, config.watchdog, config.watchdog_timeout)
+        return WatchedCommands(node, joints, topic, config.watchdog, config.watchdog_timeout)
     except (NameValidationException, RuntimeError) as error:  # RuntimeError: RCLError
         raise UserError(f"watchdog: must be the name of a node, got '{config.watchdog}': {brief(error)}") from None
 
@@ -308,6 +319,8 @@ def _load(config: InferenceConfig) -> Policy:
         raise UserError(
             f"joints: {list(config.joints)} must be distinct and hold all joints of the policy, {list(metadata.joints)}"
         )
+    if metadata.command.quantity is Quantity.JOINT_POSITION and set(config.joints) - set(metadata.joints):
+        raise UserError(f"joints: the policy commands positions, of {list(metadata.joints)} alone: name no others")
     if config.rate_hz < metadata.control_rate:
         raise UserError(
             f"rate_hz: must be at least that of the policy, {metadata.control_rate:g}, got {config.rate_hz}"
@@ -318,7 +331,7 @@ def _load(config: InferenceConfig) -> Policy:
 def _first_goal(config: InferenceConfig, policy: Policy) -> Goal | None:
     if not config.goal:
         return None
-    goal = Goal(list(config.goal), policy.metadata.goal_frame)
+    goal = Goal(list(config.goal), policy.metadata.goal.frame)
     try:
         accept(goal, policy.metadata, config.unreachable_goal == "project")
     except GoalError as error:

@@ -11,9 +11,10 @@ from pydantic import Field
 
 from physai.config import PositiveFloat
 from physai.errors import UserError
-from physai.physics import DynamicsParameters
+from physai.physics import DynamicsParameters, RobotState
 from physai.robots import RobotSpec
 from physai.ros.robot_link import RobotError, RobotLink
+from physai.signals import Quantity
 
 _HOME = 0.02  # rad; a joint this near to where it shall start is there
 _SETTLED = 5  # control periods there, standing still, until the episode starts
@@ -65,6 +66,8 @@ class RosPhysics:
                 f"env.physics.homing_speed: {homing_speed} rad/s is beyond the limit of '{spec.name}', "
                 f"{spec.velocity_limit.min():g} rad/s"
             )
+        if spec.command is not Quantity.JOINT_VELOCITY:
+            raise UserError(f"a robot behind ROS is driven by joint_velocity here, not by {spec.command.value}")
         self.num_robots = num_robots
         robot = (os.environ.get("ROS_DOMAIN_ID", "0"), *sorted(remap))
         if (before := _in_charge.get(robot, lambda: None)()) is not None:
@@ -82,13 +85,7 @@ class RosPhysics:
         self._deadline = -math.inf
         _in_charge[robot] = weakref.ref(self)
 
-    def reset(
-        self,
-        rows: np.ndarray,
-        joint_position: np.ndarray,
-        joint_velocity: np.ndarray,
-        parameters: DynamicsParameters | None = None,
-    ) -> None:
+    def reset(self, rows: np.ndarray, state: RobotState, parameters: DynamicsParameters | None = None) -> None:
         """Bring the arm to a pose [1, n], rad, where it stands; see :meth:`physai.physics.Physics.reset`.
 
         Raises:
@@ -97,7 +94,7 @@ class RosPhysics:
         """
         if parameters is not None:
             raise UserError("the dynamics of a robot behind ROS cannot be set; choose randomization=none")
-        if joint_velocity.any():
+        if state.joint_velocity.any():
             raise UserError("a robot behind ROS starts from rest")
         if not len(rows):
             return
@@ -107,7 +104,7 @@ class RosPhysics:
         if self._link.reset():
             after = time.monotonic()
         self._position, self._velocity = self._link.state(after, self._timeout)
-        self._drive(joint_position[0])
+        self._drive(state.joint_position[0])
 
     def _drive(self, goal: np.ndarray) -> None:
         """Go to a pose [n], rad, in a straight line of joint space, and stand there."""
@@ -127,7 +124,7 @@ class RosPhysics:
         way = goal - self._position
         return np.where(self._continuous, np.remainder(way + math.pi, 2 * math.pi) - math.pi, way)
 
-    def step(self, velocity_command: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def step(self, command: np.ndarray) -> RobotState:
         """See :meth:`physai.physics.Physics.step`.
 
         Periods follow each other without drift; a caller who is late by more than one starts them anew.
@@ -138,11 +135,11 @@ class RosPhysics:
         """
         self._check_open()
         try:
-            if not np.isfinite(velocity_command).all():
-                raise UserError(f"a velocity command must be finite, got {velocity_command.tolist()}")
+            if not np.isfinite(command).all():
+                raise UserError(f"a velocity command must be finite, got {command.tolist()}")
             if obstacle := self._link.obstacle:
                 raise RobotError(obstacle)
-            sent = self._link.send(velocity_command[0].tolist())
+            sent = self._link.send(command[0].tolist())
             self._deadline += self._dt
             if self._deadline < sent:
                 self._deadline = sent + self._dt
@@ -151,16 +148,11 @@ class RosPhysics:
         except BaseException:  # Ctrl-C, too
             self._link.stop()
             raise
-        return self.joint_state()
+        return self.robot_state()
 
-    def step_one(self, velocity_command: list[float]) -> tuple[list[float], list[float]]:
-        """See :meth:`physai.physics.Physics.step_one`, and ``step``."""
-        position, velocity = self.step(np.array([velocity_command]))
-        return position[0].tolist(), velocity[0].tolist()
-
-    def joint_state(self) -> tuple[np.ndarray, np.ndarray]:
-        """See :meth:`physai.physics.Physics.joint_state`."""
-        return self._position[None].copy(), self._velocity[None].copy()
+    def robot_state(self) -> RobotState:
+        """See :meth:`physai.physics.Physics.robot_state`."""
+        return RobotState(self._position[None].copy(), self._velocity[None].copy())
 
     def parameters(self) -> DynamicsParameters:
         """Not to be had."""

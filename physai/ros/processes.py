@@ -1,15 +1,16 @@
-"""Nodes in processes of their own that end when this program does, however that ends."""
+"""Nodes in processes of their own, which end with this one."""
 
 import contextlib
-import ctypes
 import os
 import signal
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 from types import TracebackType
 
-_PR_SET_PDEATHSIG = 1  # Linux: prctl(2)
+from physai.processes import die_with
+
 _PATIENCE = 5.0  # s
 
 
@@ -34,7 +35,7 @@ class NodeProcess:
                 stdout=output,
                 stderr=subprocess.STDOUT,
                 env={**os.environ, "XDG_STATE_HOME": str(log.parent.absolute())},  # no other robot's emergency stop
-                preexec_fn=_die_with_parent,
+                preexec_fn=partial(die_with, os.getpid(), signal.SIGTERM),
             )
         self.pid = self._process.pid
 
@@ -59,8 +60,3 @@ class NodeProcess:
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()
-
-
-def _die_with_parent() -> None:
-    if sys.platform == "linux":
-        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)

@@ -20,14 +20,16 @@ from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, Qo
 
 from physai.deploy.parameters import Parameters, parameter
 from physai.errors import UserError
-from physai.ros import qos
+from physai.ros import commands, qos
 from physai.ros.bag import TYPES, Bag, recover
 from physai.ros.parameters import declare
 from physai.ros.run import StoppableNode, brief, run
+from physai.signals import Quantity
 
 TOPICS = (
     "/joint_states",
-    "/joint_velocity_controller/commands",
+    commands.topic(Quantity.JOINT_VELOCITY),
+    commands.topic(Quantity.JOINT_POSITION),
     "/command_watchdog/commands",
     "/inference_node/goal",
     "/inference_node/state",

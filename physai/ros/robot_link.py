@@ -18,8 +18,9 @@ from std_srvs.srv import Trigger
 
 from physai.errors import UserError
 from physai.ros import qos
-from physai.ros.commands import VelocityCommands
+from physai.ros.commands import JointCommands, topic
 from physai.ros.run import brief, prepare_middleware
+from physai.signals import Quantity
 
 _DISCOVERY = 3.0  # s until all rivals are known, those without our settings of Fast DDS, too; 2.9 were measured
 _PATIENCE = 5.0  # s; for a robot to appear, a rival to leave, a service to answer
@@ -64,7 +65,7 @@ class RobotLink:
         self._received, self._stamp, self._refused = -math.inf, -1, ""
         self._state = np.full((2, len(self._joints)), np.nan)
         self._sent, self._moving, self._used, self._closed = -math.inf, False, False, False
-        self._commands = VelocityCommands(self._node, len(self._joints))
+        self._commands = JointCommands(self._node, len(self._joints), topic(Quantity.JOINT_VELOCITY))
         self._states = self._node.create_subscription(
             JointState,
             "/joint_states",
@@ -144,8 +145,8 @@ class RobotLink:
         """Publish zeros; return the time."""
         return self.send([0.0] * len(self._joints))
 
-    def state(self, after: float, timeout: float) -> tuple[np.ndarray, np.ndarray]:
-        """Wait for a joint state that was received after a time; return positions [n] rad and velocities [n] rad/s.
+    def state(self, after: float, timeout: float) -> np.ndarray:
+        """Wait for a joint state that was received after a time; return positions, rad, and velocities, rad/s, [2, n].
 
         Raises:
             RobotError: If none came within ``timeout`` seconds that can be used, and why.
@@ -153,8 +154,7 @@ class RobotLink:
         with self._news:
             if not self._news.wait_for(lambda: self._received > after, timeout):
                 raise RobotError(self._no_state(timeout))
-            position, velocity = self._state
-            return position, velocity
+            return self._state
 
     def reset(self) -> bool:
         """Call the reset service; False if nobody offers it.

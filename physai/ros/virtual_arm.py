@@ -1,7 +1,6 @@
-"""The arm of the virtual robot, and the velocity controller below it; no ROS in here."""
+"""The arm of the virtual robot, and the controller below it; no ROS in here."""
 
 import math
-from collections import deque
 from collections.abc import Sequence
 
 import numpy as np
@@ -10,46 +9,49 @@ import torch
 from physai.config import compose, conf_dir, nearest, validate
 from physai.envs.simulation import EnvConfig
 from physai.errors import UserError
-from physai.physics import ParameterLayout, RandomizationConfig
+from physai.physics import ActuatorDelay, ParameterLayout, RandomizationConfig, RobotState, SensorErrors
 from physai.physics.pybullet import PyBulletPhysics
 from physai.robots import RobotSpec
 from physai.seeding import derive
+from physai.signals import Quantity
 
 
-class VelocityController:
-    """What ros2_control's JointGroupVelocityController does with commands, its dangers included.
+class GroupController:
+    """What ros2_control's group controllers do with commands of joint velocities or positions, dangers included.
 
-    A command with a value that is not finite is dropped. One of a wrong length deactivates the controller: zero
-    velocity, deaf until ``activate``. The last velocity holds for ever, unless there is a timeout.
+    A command with a value that is not finite is dropped. One of a wrong length deactivates the controller, which is
+    deaf until ``activate``. The last command holds for ever, unless there is a timeout. A velocity controller stops
+    when it is over or inactive; a position controller stays where it was sent to.
 
     Args:
-        joints: n.
+        rest: What it commands at the start, [n]: zero velocities, or where the joints are.
+        quantity: What commands are.
         timeout: Seconds after which a command is over; 0 for never.
     """
 
-    def __init__(self, joints: int, timeout: float = 0.0) -> None:
+    def __init__(self, rest: np.ndarray, quantity: Quantity, timeout: float = 0.0) -> None:
         self.timeout = timeout
-        self._zeros = np.zeros(joints)
+        self._rest, self._stops = rest, quantity is Quantity.JOINT_VELOCITY
         self.activate()
 
     def activate(self) -> None:
-        """Listen again, standing still."""
+        """Listen again, at rest."""
         self.active = True
-        self._velocity, self._since = self._zeros, -math.inf
+        self._command, self._since = self._rest, -math.inf
 
-    def command(self, velocity: Sequence[float], now: float) -> None:
-        """Take a command, rad/s, at a time, s."""
+    def command(self, command: Sequence[float], now: float) -> None:
+        """Take a command, rad/s or rad, at a time, s."""
         if not self.active:
             return
-        if len(velocity) != len(self._zeros):
-            self._velocity, self.active = self._zeros, False
-        elif np.isfinite(velocity).all():
-            self._velocity, self._since = np.array(velocity, dtype=np.float64), now
+        if len(command) != len(self._rest):
+            self.active = False
+        elif np.isfinite(command).all():
+            self._command, self._since = np.array(command, dtype=np.float64), now
 
-    def velocity(self, now: float) -> np.ndarray:
-        """Return what the motors are told now, [n] rad/s."""
-        over = self.timeout > 0 and now - self._since > self.timeout
-        return self._zeros if over else self._velocity
+    def value(self, now: float) -> np.ndarray:
+        """Return what the motors are told now, [n] rad/s or rad."""
+        over = not self.active or (self.timeout > 0 and now - self._since > self.timeout)
+        return self._rest if over and self._stops else self._command
 
 
 class VirtualArm:
@@ -60,48 +62,46 @@ class VirtualArm:
         randomization: A file of ``conf/randomization``.
         seed: Draws one robot from it.
         period: Time from step to step, s.
+        overrides: Hydra overrides such as ``env.robot.command=joint_position``.
 
     Raises:
         UserError: If there is no such config.
     """
 
-    def __init__(self, env: str, randomization: str, seed: int, period: float) -> None:
+    def __init__(self, env: str, randomization: str, seed: int, period: float, overrides: Sequence[str] = ()) -> None:
         for group, name in (("env", env), ("randomization", randomization)):
             files = [path.stem for path in (conf_dir() / group).glob("*.yaml")]
             if name not in files:
                 raise UserError(f"{group}: no file '{name}' in conf/{group}{nearest(name, files)}")
-        node = compose("train", [f"env={env}", f"randomization={randomization}"])
+        node = compose("train", [f"env={env}", f"randomization={randomization}", *overrides])
         config = validate(EnvConfig, node.env)
         draws = validate(RandomizationConfig, node.randomization)
         self.spec = RobotSpec.from_config(config.robot)
         self._physics = PyBulletPhysics(self.spec, 1, period)
         layout = ParameterLayout(self.spec)
-        row = draws.sample(1, layout, torch.Generator().manual_seed(derive(seed, "virtual robot"))).numpy()
-        self._dynamics = layout.dynamics(row)
-        parameters = row[0].astype(np.float64)
-        self._offset, self._position_noise, self._velocity_noise, delay = (
-            parameters[layout.columns[name]]
-            for name in ("encoder_offset", "position_noise", "velocity_noise", "actuator_delay")
-        )
-        self._delay = round(float(delay[0]) * config.control_dt / period)
-        self._random = np.random.default_rng(derive(seed, "sensors"))
+        self._parameters = draws.sample(1, layout, torch.Generator().manual_seed(derive(seed, "virtual robot")))
+        self._dynamics = layout.dynamics(self._parameters.numpy())
+        delay = float(self._parameters[0, layout.columns["actuator_delay"]])
+        self._steps = np.array([round(delay * config.control_dt / period)])
+        self._delay = ActuatorDelay(1, len(self.spec.joints))
+        self._errors = SensorErrors(layout)
+        self._random = torch.Generator().manual_seed(derive(seed, "sensors"))
+        takes_positions = self.spec.command is Quantity.JOINT_POSITION
+        self.rest = self.spec.home if takes_positions else np.zeros_like(self.spec.home)
         self.reset()
 
     def reset(self) -> None:
         """Stand still at home."""
-        n = len(self.spec.joints)
-        self._commands = deque([np.zeros(n)] * (self._delay + 1), maxlen=self._delay + 1)
-        self._physics.reset(np.zeros(1, dtype=int), self.spec.home[None], np.zeros((1, n)), self._dynamics)
+        home, row = self.spec.home[None], np.zeros(1, dtype=int)
+        self._physics.reset(row, RobotState(home, np.zeros_like(home)), self._dynamics)
+        self._delay.reset(row, self.rest[None], self._steps)
 
-    def step(self, velocity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Hold velocities [n] rad/s for a period; return what the sensors say, rad [n] and rad/s [n]."""
-        self._commands.append(velocity)
-        position, speed = self._physics.step(self._commands[0][None])
-        noise = self._random.standard_normal((2, len(velocity)))
-        return (
-            position[0] + self._offset + noise[0] * self._position_noise,
-            speed[0] + noise[1] * self._velocity_noise,
-        )
+    def step(self, command: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Hold a command [n], rad/s or rad, for a period; return what the sensors say, rad [n] and rad/s [n]."""
+        state = self._physics.step(self._delay(command[None]))
+        true = torch.from_numpy(state.joint_position), torch.from_numpy(state.joint_velocity)
+        position, velocity = self._errors(*true, self._parameters.double(), self._random)
+        return position[0].numpy(), velocity[0].numpy()
 
     def close(self) -> None:
         """Free the physics engine."""

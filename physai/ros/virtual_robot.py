@@ -1,4 +1,4 @@
-"""A PyBullet arm behind the topics of a ros2_control velocity controller: a real robot's place, without its dangers."""
+"""A PyBullet arm behind the topics of a ros2_control controller: a real robot's place, without its dangers."""
 
 import sys
 import time
@@ -14,10 +14,11 @@ from physai.deploy import JointState
 from physai.deploy.parameters import parameter
 from physai.errors import UserError
 from physai.ros import qos
+from physai.ros.commands import topic
 from physai.ros.faults import FaultConfig, Faults
 from physai.ros.parameters import declare
 from physai.ros.run import StoppableNode, run
-from physai.ros.virtual_arm import VelocityController, VirtualArm
+from physai.ros.virtual_arm import GroupController, VirtualArm
 
 
 @dataclass(frozen=True)
@@ -25,6 +26,9 @@ class VirtualRobotConfig(FaultConfig):
     """Parameters of the virtual robot."""
 
     env: str = parameter("reacher", "a file of conf/env, which names the robot", fixed=True)
+    overrides: tuple[str, ...] = parameter(
+        (), "Hydra overrides of it, such as env.robot.command=joint_position", fixed=True
+    )
     randomization: str = parameter("none", "a file of conf/randomization: its dynamics, delay and sensors", fixed=True)
     seed: int = parameter(0, "draws one robot from the randomization", "", 0, 2**31 - 1, fixed=True)
     rate_hz: float = parameter(100.0, "joint states per second, and physics steps", "Hz", 1.0, 1000.0, fixed=True)
@@ -36,7 +40,7 @@ class VirtualRobotConfig(FaultConfig):
 
 
 class VirtualRobot(StoppableNode):
-    """Publishes /joint_states, and obeys /joint_velocity_controller/commands as the real controller does.
+    """Publishes /joint_states, and obeys the commands of its robot's controller as the real one does.
 
     Raises:
         UserError: If a parameter is wrong.
@@ -45,7 +49,7 @@ class VirtualRobot(StoppableNode):
     def __init__(self) -> None:
         super().__init__("virtual_robot")
         config = declare(self, VirtualRobotConfig, self._configure)
-        self._arm = VirtualArm(config.env, config.randomization, config.seed, 1.0 / config.rate_hz)
+        self._arm = VirtualArm(config.env, config.randomization, config.seed, 1.0 / config.rate_hz, config.overrides)
         known = self._arm.spec.joints
         joints = config.joints or known
         if sorted(joints) != sorted(known):
@@ -55,15 +59,15 @@ class VirtualRobot(StoppableNode):
         if len(set(self._names)) != len(self._names):
             raise UserError(f"state_joints: must be distinct, got {list(self._names)}")
         self._shown = [(i, known.index(joint)) for i, joint in enumerate(self._names) if joint in known]
-        self._controller = VelocityController(len(joints), config.command_timeout)
+        rest = self._arm.rest[[known.index(joint) for joint in joints]]
+        self._controller = GroupController(rest, self._arm.spec.command, config.command_timeout)
         self._faults = Faults(config, config.seed)
         self._states = self.create_publisher(JointStateMessage, "/joint_states", 10)
-        self.create_subscription(
-            Float64MultiArray, "/joint_velocity_controller/commands", self._take_command, qos.COMMAND
-        )
+        commands = topic(self._arm.spec.command)
+        self.create_subscription(Float64MultiArray, commands, self._take_command, qos.COMMAND)
         self.create_service(Trigger, "~/reset", self._reset)
         self.create_timer(1.0 / config.rate_hz, self._step, clock=Clock(clock_type=ClockType.STEADY_TIME))
-        self.get_logger().info(f"'{self._arm.spec.name}' takes velocities of {list(joints)}")
+        self.get_logger().info(f"'{self._arm.spec.name}' takes {self._arm.spec.command.value} of {list(joints)}")
 
     def _configure(self, config: VirtualRobotConfig) -> None:
         self._faults.config = config
@@ -74,7 +78,7 @@ class VirtualRobot(StoppableNode):
         self._controller.command(message.data, time.monotonic())
         if was and not self._controller.active:
             self.get_logger().error(
-                f"{len(message.data)} velocities for {len(self._order)} joints: inactive until ~/reset"
+                f"{len(message.data)} numbers for {len(self._order)} joints: inactive until ~/reset"
             )
 
     def _reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
@@ -85,7 +89,7 @@ class VirtualRobot(StoppableNode):
 
     def _step(self) -> None:
         now = time.monotonic()
-        position, velocity = self._arm.step(self._controller.velocity(now)[self._order])
+        position, velocity = self._arm.step(self._controller.value(now)[self._order])
         positions, velocities = [0.0] * len(self._names), [0.0] * len(self._names)
         for place, joint in self._shown:
             positions[place], velocities[place] = float(position[joint]), float(velocity[joint])

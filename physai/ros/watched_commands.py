@@ -1,4 +1,4 @@
-"""Velocity commands by way of a watchdog, and past it while it does not answer: zeros alone."""
+"""Joint commands by way of a watchdog, and past it while it does not answer: those alone that stand still."""
 
 import math
 import time
@@ -8,15 +8,16 @@ from rclpy.node import Node
 from std_msgs.msg import Empty
 
 from physai.ros import qos
-from physai.ros.commands import VelocityCommands
+from physai.ros.commands import JointCommands
 
 
-class WatchedCommands(VelocityCommands):
-    """Publishes to a command_watchdog, which tells that it lives; and, when it does not, zeros to the controller.
+class WatchedCommands(JointCommands):
+    """Publishes to a command_watchdog, which tells that it lives; and, when it does not, stops the controller itself.
 
     Args:
         node: Whose remaps hold.
-        joints: How many velocities a command has.
+        joints: How many numbers a command has.
+        topic: Where the controller takes commands.
         watchdog: Name of its node, such as ``/command_watchdog``.
         timeout: A watchdog that was silent for longer does not answer, s.
 
@@ -24,10 +25,10 @@ class WatchedCommands(VelocityCommands):
         silences: How often it has ceased to answer.
     """
 
-    def __init__(self, node: Node, joints: int, watchdog: str, timeout: float) -> None:
+    def __init__(self, node: Node, joints: int, topic: str, watchdog: str, timeout: float) -> None:
         super().__init__(node, joints, f"{watchdog}/commands")
         # There from the start: what has to be found first is late.
-        self._past = VelocityCommands(node, joints, partners=f"{watchdog}/heartbeat")
+        self._past = JointCommands(node, joints, topic, partners=f"{watchdog}/heartbeat")
         node.create_subscription(
             Empty,
             f"{watchdog}/heartbeat",
@@ -54,14 +55,15 @@ class WatchedCommands(VelocityCommands):
         self.silences += before and not self._answering
         return None if self._answering else f"the watchdog {self._name} does not answer, or waits for its ~/reset"
 
-    def send(self, velocity: Sequence[float]) -> None:
-        """Publish a command; while the watchdog does not answer, zeros past it first."""
+    def send(self, command: Sequence[float]) -> None:
+        """Publish a command; while the watchdog does not answer, stop past it first."""
         if time.monotonic() - self._last > self.timeout:
+            self._past.still = self.still
             self._past.stop()
-        super().send(velocity)
+        super().send(command)
 
     def finish(self) -> None:
-        """Publish zeros on both ways until they have surely arrived: the watchdog may just have ceased to answer."""
+        """Stop on both ways until this has surely arrived: the watchdog may just have ceased to answer."""
         self._last = -math.inf
         super().finish()
         self._past.wait()

@@ -70,9 +70,11 @@ class Ring:
         return self.inner - _EDGE <= math.hypot(*goal) <= self.outer + _EDGE
 
     def project(self, goal: np.ndarray) -> np.ndarray | None:
-        """See :class:`Region`; no point is nearest to the centre."""
+        """See :class:`Region`; no point is nearest to the centre, or to one whose distance is no number."""
         radius = math.hypot(*goal)
-        return goal * (min(max(radius, self.inner), self.outer) / radius) if radius > _EDGE else None
+        if not _EDGE < radius < math.inf:
+            return None
+        return goal * (min(max(radius, self.inner), self.outer) / radius)
 
     def describe(self, goal: np.ndarray) -> str:
         """See :class:`Region`."""

@@ -22,6 +22,7 @@ from physai.policies import input_size
 from physai.seeding import derive
 from physai.targets import make
 from physai.training.config import TrainConfig
+from physai.transforms import RunningStatistics
 
 logging.getLogger("torchrl").setLevel(logging.WARNING)  # at INFO it reports every storage that it allocates
 
@@ -30,9 +31,19 @@ _NETWORK = ("in_keys", "out_keys", "parameters", "state_dict")
 
 @dataclass
 class Agent:
-    """What learns, and where: env, collector, networks, algorithm."""
+    """What learns, and where.
+
+    Attributes:
+        env: Robots of the learner's own process: all that it collects from, or one that shows what others are like.
+        statistics: Of observations; they renew the normalizer that env, collector and algorithm refer to.
+        actor: The policy.
+        critic: What it is judged by.
+        algorithm: What changes both.
+        collector: Where batches come from.
+    """
 
     env: TransformedRobotEnv
+    statistics: RunningStatistics
     actor: TensorDictModuleBase
     critic: TensorDictModuleBase
     algorithm: Algorithm
@@ -57,7 +68,7 @@ class Agent:
         torch.manual_seed(derive(config.seed, "learner"))
         memory = config.policy.memory_size
         make_robots = partial(make_env, config.env, config.randomization, config.normalization, memory_size=memory)
-        env = make_robots(config.collector.robots_here, derive(config.seed, "train"))
+        env = make_robots(config.collector.envs_of_learner, derive(config.seed, "train"))
         actor = make_actor(config, env).to(device)
         judged = Composite(**env.observation_spec, **env.full_action_spec, shape=env.batch_size)
         inputs = input_size(judged, _in_keys(config.policy.critic, "policy.critic"), "policy.critic")
@@ -66,7 +77,7 @@ class Agent:
             "algo",
             config.algo,
             needs=("update", "weights", "state", "set_state", "warmup_frames"),
-            networks=Networks(actor, critic, env.normalization.normalizer),
+            networks=Networks(actor, critic, env.normalizer),
             frames_per_batch=config.collector.frames_per_batch,
         )
         collector = make_collector(
@@ -79,12 +90,13 @@ class Agent:
             algorithm.warmup_frames,
             device,
         )
-        return cls(env, actor, critic, algorithm, collector)
+        statistics = RunningStatistics(env.normalizer, config.normalization.eps)
+        return cls(env, statistics, actor, critic, algorithm, collector)
 
     def weights_sha256(self) -> str:
         """Hash of the networks' weights and the normalization statistics."""
         digest = hashlib.sha256()
-        for weights in (self.algorithm.weights(), self.env.normalization.state_dict()):
+        for weights in (self.algorithm.weights(), self.statistics.state_dict()):
             for name, value in sorted(weights.items()):
                 digest.update(name.encode())
                 digest.update(value.cpu().contiguous().numpy().tobytes())
@@ -103,8 +115,26 @@ class Agent:
         """What acting needs: the actor's weights and the normalization statistics."""
         return {
             "actor": {key: value.cpu().clone() for key, value in self.actor.state_dict().items()},
-            "normalization": {key: value.clone() for key, value in self.env.normalization.state_dict().items()},
+            "normalization": {key: value.clone() for key, value in self.statistics.state_dict().items()},
         }
+
+    def state(self) -> dict[str, Any]:
+        """Return what ``set_state`` needs to go on bit for bit."""
+        return {
+            **self.policy_state(),
+            "algorithm": self.algorithm.state(),
+            "collector": self.collector.state(),
+            "random": torch.get_rng_state(),
+            "random_on_gpus": torch.cuda.get_rng_state_all() if self.on_gpu else [],
+        }
+
+    def set_state(self, state: dict[str, Any]) -> None:
+        """Restore what ``state`` returned, in an agent built from the same config."""
+        self.algorithm.set_state(state["algorithm"])
+        self.collector.set_state(state["collector"])
+        self.statistics.load_state_dict(state["normalization"])
+        torch.set_rng_state(state["random"])
+        torch.cuda.set_rng_state_all(state["random_on_gpus"])
 
     def close(self) -> None:
         """Free the robots."""
@@ -133,10 +163,11 @@ def load_policy_state(actor: TensorDictModuleBase, env: TransformedRobotEnv, sta
     """Give an actor its weights and an env its normalization statistics."""
     try:
         actor.load_state_dict(state["actor"])
-        env.normalization.load_state_dict(state["normalization"])
+        statistics = RunningStatistics(env.normalizer, eps=1.0)  # which no update asks for here
+        statistics.load_state_dict(state["normalization"])
     except (RuntimeError, LookupError, TypeError, ValueError, AttributeError) as error:
         reason = (str(error) or type(error).__name__).splitlines()[0][:120]
-        raise UserError(f"the checkpoint does not fit the run's config: {reason}") from None
+        raise UserError(f"the checkpoint does not fit the run's config: {reason}") from error
 
 
 def make_evaluation_env(

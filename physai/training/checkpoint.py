@@ -1,46 +1,22 @@
-"""Checkpoints that survive a kill: written to a temporary name, synced, renamed; read without running code."""
+"""Checkpoints: whole after a kill, too, and read without running code."""
 
 import io
-import os
 from pathlib import Path
 from typing import Any
 
 import torch
 
 from physai.errors import UserError
+from physai.files import write_atomically
 
-_FORMAT = 2
-
-
-def write(path: Path, content: bytes) -> None:
-    """Write a file; whatever happens, ``path`` holds either the old content or the new.
-
-    Raises:
-        OSError: If the disk refuses.
-    """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.tmp")
-    temporary.unlink(missing_ok=True)  # of a write that was killed; or a link, which would be written through
-    try:
-        with open(temporary, "xb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
-    folder = os.open(path.parent, os.O_RDONLY)
-    try:
-        os.fsync(folder)
-    finally:
-        os.close(folder)
+_FORMAT = 3
 
 
 def save(path: Path, content: dict[str, Any]) -> None:
-    """Write tensors and plain values, as safely as ``write``."""
+    """Write tensors and plain values, as safely as :func:`physai.files.write_atomically`."""
     buffer = io.BytesIO()
     torch.save({"format": _FORMAT, **content}, buffer)
-    write(path, buffer.getvalue())
+    write_atomically(path, buffer.getvalue())
 
 
 def load(path: Path) -> dict[str, Any]:

@@ -70,5 +70,6 @@ class TrainConfig(Config):
     total_frames: Count
     device: Annotated[str, Field(pattern=r"^(cpu|cuda(:\d+)?)$")]
     threads: Count
+    export: list[Literal["torchscript", "onnx"]]
     resume: None  # the command takes it before a config is made
     allow: list[PackageName]  # for resume: what a new run names is the user's own

@@ -19,7 +19,7 @@ class Evaluation:
     Attributes:
         success: Whether the last step of the episode was a success.
         length: Control steps until the first success of an episode that ended with one, or until its end.
-        error: The task's first error at the end, in its unit.
+        error: The task's largest error at the end, of those in the unit of its first one.
         episode_return: Sum of rewards.
         unit: Of the error.
     """
@@ -70,13 +70,16 @@ def evaluate(policy: TensorDictModuleBase, env: TransformedRobotEnv, episodes: i
     """
     env.set_seed(seed)
     rounds = [_one_round(policy, env) for _ in range(-(-episodes // env.simulation.num_envs))]
-    success, length, error, episode_return = (torch.cat(column)[:episodes] for column in zip(*rounds, strict=True))
+    columns = (torch.cat(column)[:episodes] for column in zip(*rounds, strict=True))
+    success, length, error, episode_return = columns
     return Evaluation(success, length, error, episode_return, env.simulation.task.tolerances[0].unit)
 
 
 @torch.no_grad()
 def _one_round(policy: TensorDictModuleBase, env: TransformedRobotEnv) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     tensordict = env.reset()
+    tolerances = env.simulation.task.tolerances
+    columns = [i for i, tolerance in enumerate(tolerances) if tolerance.unit == tolerances[0].unit]
     robots = env.simulation.num_envs
     finished, success = torch.zeros(2, robots, dtype=torch.bool)
     length, first = torch.zeros(2, robots, dtype=torch.int64)
@@ -91,6 +94,6 @@ def _one_round(policy: TensorDictModuleBase, env: TransformedRobotEnv) -> tuple[
             finished |= now
             success[now] = succeeds[now]
             length[now] = torch.where(succeeds, first, steps)[now]
-            error[now] = torch.from_numpy(env.simulation.error[:, 0]).float()[now]
+            error[now] = torch.from_numpy(env.simulation.error[:, columns].max(axis=1)).float()[now]
             episode_return[now] = tensordict.get("episode_rewards").sum(dim=1)[now]
     return success, length, error, episode_return

@@ -7,6 +7,8 @@ from pathlib import Path
 import mlflow  # where it is missing, this module is, and a config that names it is refused
 from torchrl.record import loggers
 
+from physai.files import write_atomically
+
 logging.getLogger("mlflow").setLevel(logging.WARNING)  # at INFO it reports every table of a new database
 
 
@@ -26,7 +28,7 @@ class MLFlowLogger(loggers.MLFlowLogger):
             os.environ["MLFLOW_RUN_ID"] = known.read_text().strip()  # MLflow goes on with this one
         artifacts = None if tracking_uri else (folder / "mlflow").as_uri()
         super().__init__(exp_name, tracking_uri or f"sqlite:///{folder}/mlflow.db", artifact_location=artifacts)
-        known.write_text(f"{self.experiment.info.run_id}\n")
+        write_atomically(known, f"{self.experiment.info.run_id}\n".encode())
         mlflow.set_tag("mlflow.runName", log_dir)
 
     def shutdown(self, timeout: float | None = None) -> None:

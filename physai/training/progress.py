@@ -2,7 +2,6 @@
 
 import sys
 import time
-from types import TracebackType
 
 from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.progress import Progress as RichProgress
@@ -35,13 +34,12 @@ class Progress:
         self._started = time.monotonic()
         self._first = frames
 
-    def __enter__(self) -> "Progress":
+    def start(self) -> None:
+        """Show it."""
         self._bar.start()
-        return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def stop(self) -> None:
+        """Leave it as it is."""
         self._bar.stop()
 
     def update(self, frames: int, frames_per_second: float, values: dict[str, float]) -> None:

@@ -1,8 +1,10 @@
-"""A whole run: train, judge the best policy on goals it has never seen, write it all down."""
+"""A whole run: train, evaluate the best policy on goals it has never seen, write it all down."""
 
+import contextlib
 import json
 import subprocess
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,13 +18,16 @@ from physai.config import validate
 from physai.envs.make import TransformedRobotEnv
 from physai.envs.simulation import EnvConfig
 from physai.errors import UserError
+from physai.files import write_atomically
 from physai.physics import RandomizationConfig
 from physai.seeding import derive
 from physai.training import checkpoint
-from physai.training.agent import Agent, load_policy_state, make_actor, make_evaluation_env
+from physai.training.agent import Agent, load_policy_state, make_actor, make_evaluation_env, make_logger
+from physai.training.callbacks import CheckpointCallback, EvaluationCallback, LogCallback, ProgressCallback
 from physai.training.config import TrainConfig
 from physai.training.evaluation import MAX_ROBOTS, Evaluation, evaluate
-from physai.training.loop import Clock, Interrupted, stop_signals, train
+from physai.training.stopping import Interrupted, stop_signals
+from physai.training.trainer import Trainer
 
 FINAL_SEED = derive(0, "final evaluation goals")
 
@@ -70,17 +75,18 @@ def run_training(
             raise UserError(f"{done}: the run's summary is damaged") from None
         return summary
     agent = agent or Agent.build(config)
-    for name in config.randomization.without_effect(agent.env.simulation.layout):
-        print(f"randomization.{name} has no effect: it scales what is zero in '{config.env.robot.name}'")
-    with stop_signals() as stop:
-        agent, clock = train(config, run_dir, resume, stop, agent)
-        print(f"Judging the best policy on {config.evaluation.episodes:,} goals it has never seen ...", flush=True)
-        try:
-            result = TrainedPolicy(run_dir, "best", config=config).evaluate(config.evaluation.episodes)
-            summary = _summary(config, agent, clock, result)
-        finally:
-            agent.close()
-        checkpoint.write(done, json.dumps(summary, indent=2).encode())
+    with contextlib.closing(agent), stop_signals() as stop:
+        for name in config.randomization.without_effect(agent.env.simulation.layout):
+            print(f"randomization.{name} has no effect: it scales what is zero in '{config.env.robot.name}'")
+        evaluation = EvaluationCallback(config)
+        trainer = make_trainer(config, run_dir, agent, evaluation, resume)
+        trainer.fit(stop)
+        if stop:
+            raise Interrupted(stop[0])
+        print(f"Evaluating the best policy on {config.evaluation.episodes:,} goals it has never seen ...", flush=True)
+        result = TrainedPolicy(run_dir, "best", config=config).evaluate(config.evaluation.episodes)
+        summary = _summary(config, trainer, evaluation.best_frames, result)
+        write_atomically(done, json.dumps(summary, indent=2).encode())
         from physai.plotting import plot_runs  # no frame needs to wait for Matplotlib
 
         try:
@@ -94,8 +100,38 @@ def run_training(
     return summary
 
 
+def make_trainer(
+    config: TrainConfig, run_dir: Path, agent: Agent, evaluation: EvaluationCallback, resume: bool = False
+) -> Trainer:
+    """Put a run together.
+
+    Args:
+        config: The run's.
+        run_dir: Where checkpoints and logs go.
+        agent: Built from ``config``.
+        evaluation: Evaluates it while it trains.
+        resume: Whether to go on from the last checkpoint, if there is one.
+
+    Raises:
+        UserError: If it cannot be resumed.
+    """
+    folder = checkpoint.CheckpointFolder(run_dir / "checkpoints", config.checkpoint.keep)
+    callbacks = [
+        evaluation,
+        LogCallback(run_dir, partial(make_logger, config, run_dir)),
+        CheckpointCallback(config.checkpoint.every_frames),
+        ProgressCallback(),
+    ]
+    trainer = Trainer(agent, config.total_frames, run_dir, folder, callbacks)
+    if resume and folder.paths():
+        trainer.restore()
+    elif (run_dir / "metrics.csv").exists():
+        raise UserError(f"{run_dir}: its checkpoints are gone; it cannot be resumed")
+    return trainer
+
+
 class TrainedPolicy:
-    """A checkpoint of a run, to be judged or watched.
+    """A checkpoint of a run, to be evaluated or watched.
 
     Args:
         run_dir: The run folder.
@@ -148,7 +184,7 @@ class TrainedPolicy:
         return actor, env
 
     def evaluate(self, episodes: int, seed: int = FINAL_SEED) -> Evaluation:
-        """Judge it on so many goals."""
+        """Evaluate it on so many goals."""
         actor, env = self.deploy(min(episodes, MAX_ROBOTS) if self.config.env.simulated else 1, seed)
         try:
             return evaluate(actor, env, episodes, seed)
@@ -156,16 +192,17 @@ class TrainedPolicy:
             env.close()
 
 
-def _summary(config: TrainConfig, agent: Agent, clock: Clock, result: Evaluation) -> dict[str, Any]:
+def _summary(config: TrainConfig, trainer: Trainer, best_frames: int, result: Evaluation) -> dict[str, Any]:
+    clock = trainer.clock
     return {
         "env": config.env.name,
         **result.summary(),
         "randomization": config.evaluation.randomization.name,
         "frames": clock.frames,
-        "best_frames": clock.best_frames,
+        "best_frames": best_frames,
         "train_seconds": round(clock.seconds, 3),
         "frames_per_second": round(clock.frames / clock.seconds, 1),
-        "weights_sha256": agent.weights_sha256(),
+        "weights_sha256": trainer.agent.weights_sha256(),
         "seed": config.seed,
         "git_commit": git_commit(),
     }

@@ -1,7 +1,7 @@
 """TorchRL transforms between the robot's sensors and the policy's input."""
 
 from physai.transforms.memory import Memory
-from physai.transforms.normalization import ObservationNormalization
+from physai.transforms.normalization import Normalizer, ObservationNormalization, RunningStatistics
 from physai.transforms.observation import Observation
 from physai.transforms.randomization import DomainRandomization
 from physai.transforms.sensing import SensorModel
@@ -9,7 +9,9 @@ from physai.transforms.sensing import SensorModel
 __all__ = [
     "DomainRandomization",
     "Memory",
+    "Normalizer",
     "Observation",
     "ObservationNormalization",
+    "RunningStatistics",
     "SensorModel",
 ]

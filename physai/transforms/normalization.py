@@ -28,27 +28,27 @@ class Normalizer(nn.Module):
         return ((observation - self.loc) / self.scale).clamp(-self.clip, self.clip)
 
 
-class ObservationNormalization(Transform):
-    """Writes ``normalized_observation = clamp((observation - loc) / scale)``.
+class RunningStatistics(nn.Module):
+    """Mean and variance of all observations so far, which the learner owns; they renew its ``Normalizer``.
 
-    The statistics are fixed while a batch is collected; the learner calls ``update`` once per collected batch. They
-    are exact (Chan, Golub and LeVeque, "Algorithms for computing the sample variance", 1983), in float64, and part
-    of ``state_dict``. (TorchRL's VecNormV2 counts untouched rows again at partial resets, keeps statistics per
-    robot, and does not freeze in evaluation.)
+    The normalizer is fixed while a batch is collected; the learner calls ``update`` once per collected batch. The
+    statistics are exact (Chan, Golub and LeVeque, "Algorithms for computing the sample variance", 1983), in float64.
+    (TorchRL's VecNormV2 counts untouched rows again at partial resets, keeps statistics per robot, and does not freeze
+    in evaluation.)
 
     Args:
-        size: Length of an observation.
+        normalizer: What is renewed.
         eps: Lower bound of the scale, in the observation's units.
-        clip: Bound of the result, in standard deviations.
     """
 
-    def __init__(self, size: int, eps: float, clip: float) -> None:
-        super().__init__(in_keys=["observation"], out_keys=["normalized_observation"])
+    def __init__(self, normalizer: Normalizer, eps: float) -> None:
+        super().__init__()
+        self.normalizer = normalizer
         self.eps = eps
-        self.normalizer = Normalizer(size, clip)
         self.count: Tensor
         self.mean: Tensor
         self.variance: Tensor
+        size = len(normalizer.loc)
         self.register_buffer("count", torch.zeros((), dtype=torch.float64))
         self.register_buffer("mean", torch.zeros(size, dtype=torch.float64))
         self.register_buffer("variance", torch.ones(size, dtype=torch.float64))
@@ -64,9 +64,21 @@ class ObservationNormalization(Transform):
             variance = self.variance * (1 - share) + variance * share + delta.square() * share * (1 - share)
             mean = self.mean + delta * share
         self.count, self.mean, self.variance = count, mean, variance
-        # In place: other processes may look on.
+        # In place: transforms and collectors refer to the normalizer.
         self.normalizer.loc.copy_(mean)
         self.normalizer.scale.copy_(variance.sqrt()).clamp_(min=self.eps)
+
+
+class ObservationNormalization(Transform):
+    """Writes ``normalized_observation``, as its normalizer makes it of ``observation``.
+
+    Args:
+        normalizer: The learner's, or a copy of it.
+    """
+
+    def __init__(self, normalizer: Normalizer) -> None:
+        super().__init__(in_keys=["observation"], out_keys=["normalized_observation"])
+        self.normalizer = normalizer
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         return next_tensordict.set("normalized_observation", self.normalizer(next_tensordict.get("observation")))

@@ -19,7 +19,7 @@ from physai.artifact.onnx import describe
 from physai.deploy import load_policy, read_metadata
 from physai.deploy.metadata import metadata_sha256
 from physai.errors import UserError
-from tests.training.small import SMALL, command
+from tests.training.small import EXPORTED, SMALL, command
 
 
 @pytest.fixture
@@ -43,7 +43,7 @@ def test_the_hash_beside_the_policy_is_its_own(exported_run):
 
 def test_the_metadata_says_everything_a_robot_must_know(exported_run):
     raw = metadata_of(exported_run)
-    assert (raw["format"], raw["format_version"]) == ("physai.policy", 1)
+    assert (raw["format"], raw["format_version"]) == ("physai.policy", 2)
     assert raw["robot"]["name"] == "planar_arm"
     assert raw["robot"]["joints"] == ["joint1", "joint2"]
     assert raw["limits"] == {
@@ -52,11 +52,19 @@ def test_the_metadata_says_everything_a_robot_must_know(exported_run):
         "effort": [5.0, 3.0],
         "command": [2.0, 2.0],
     }
-    assert raw["units"]["joint_velocity_command"] == "rad/s"
     assert raw["control_rate"] == 50.0
-    assert raw["inputs"] == {"joint_position": ["N", 2], "joint_velocity": ["N", 2], "goal": ["N", 2]}
-    assert raw["outputs"] == {"joint_velocity_command": ["N", 2]}
-    assert raw["goal"] == {"frame": "base", "radius": [0.30, 0.53], "tolerance": 0.05}
+    assert [(one["name"], one["shape"], one["unit"]) for one in raw["inputs"] + raw["outputs"]] == [
+        ("joint_position", [2], "rad"),
+        ("joint_velocity", [2], "rad/s"),
+        ("goal", [2], "m"),
+        ("joint_velocity_command", [2], "rad/s"),
+    ]
+    assert raw["inputs"][0]["low"] == [None, -2.6]
+    assert raw["inputs"][2]["frame"] == "base"
+    assert raw["goal"] == {
+        "region": {"kind": "ring", "inner": 0.30, "outer": 0.53},
+        "tolerances": [{"name": "distance", "unit": "m", "value": 0.05}],
+    }
     urdf = Path(physai.__path__[0]) / "robots" / "assets" / "planar_arm.urdf"
     assert raw["robot"]["urdf_sha256"] == hashlib.sha256(urdf.read_bytes()).hexdigest()
     assert raw["config"]["total_frames"] == 120_000
@@ -96,10 +104,11 @@ def test_an_ideal_arm_reaches_twenty_goals_in_a_row_without_going_home(exported_
     q = v = farthest = torch.zeros(arms, 2)
     for _ in range(20):
         radius, angle = torch.rand(2, arms, 1, generator=draw)
-        inner, outer = metadata.goal_radius
-        goal = (inner + (outer - inner) * radius) * torch.cat([torch.cos(6.2832 * angle), torch.sin(6.2832 * angle)], 1)
+        ring = metadata.region
+        radius = ring.inner + (ring.outer - ring.inner) * radius
+        goal = radius * torch.cat([torch.cos(6.2832 * angle), torch.sin(6.2832 * angle)], 1)
         for _ in range(200):
-            away = policy.distance(q, goal) >= metadata.goal_tolerance
+            away = policy.error(q, goal) >= metadata.tolerances[0].value
             v = policy(q, v, goal) * away
             q = torch.clamp(q + v / metadata.control_rate, lower, upper)
             farthest = torch.maximum(farthest, q.abs())
@@ -120,7 +129,7 @@ def plant(monkeypatch, defect):
 def test_what_does_not_pass_the_gate_leaves_the_old_files_as_they_were(copied, monkeypatch):
     before = {path: path.read_bytes() for path in copied.glob("policy.*")}
     assert len(before) == 3
-    plant(monkeypatch, lambda policy: policy.normalizer.loc.zero_())
+    plant(monkeypatch, lambda policy: policy.pipeline.normalizer.loc.zero_())
     with pytest.raises(gate.GateError, match="normalized_observation differs by"):
         export_policy(copied, "best", ["torchscript", "onnx"])
     assert {path: path.read_bytes() for path in copied.glob("policy.*")} == before
@@ -133,7 +142,9 @@ def test_a_file_for_joints_in_another_order_is_refused_before_it_is_written(copi
 
     def swapped(*parts):
         content = described(*parts)
-        content["robot"]["joints"].reverse()
+        for labels in (content["robot"]["joints"], *(one["labels"] for one in content["inputs"] + content["outputs"])):
+            if "joint1" in labels:
+                labels.reverse()
         return content
 
     monkeypatch.setattr(module.describe, "describe_robot", swapped)
@@ -170,7 +181,16 @@ def test_inspect_shows_it_to_people(exported_run, capsys, monkeypatch, name):
     monkeypatch.setenv("COLUMNS", "200")
     show(exported_run / name)
     shown = capsys.readouterr().out
-    for part in ("planar_arm", "joint2", "-2.6 to 2.6", "50 Hz", "0.3 to 0.53 m", "success", "torchrl", '"clip": 10.0'):
+    for part in (
+        "planar_arm",
+        "joint2",
+        "-2.6 to 2.6",
+        "50 Hz",
+        "inner 0.3, outer 0.53",
+        "success",
+        "torchrl",
+        '"clip": 10.0',
+    ):
         assert part in shown
 
 
@@ -186,7 +206,7 @@ def test_inspect_names_what_people_are_not_told(exported_run, tmp_path):
 
 @pytest.mark.slow
 def test_training_the_kuka_leaves_a_policy_and_its_hash(tmp_path):
-    process = command("train", *SMALL, "env=kuka_reacher", "hydra.run.dir=run", cwd=tmp_path)
+    process = command("train", *SMALL, EXPORTED, "env=kuka_reacher", "hydra.run.dir=run", cwd=tmp_path)
     output = process.communicate()[0]
     assert process.returncode == 0, output
     names = {"policy.pt", "policy.pt.sha256", "policy.onnx"}
@@ -194,4 +214,4 @@ def test_training_the_kuka_leaves_a_policy_and_its_hash(tmp_path):
     assert "Written to run: policy.pt, policy.onnx, policy.pt.sha256" in output
     policy = load_policy(tmp_path / "run" / "policy.pt", expect_joints=["lbr_iiwa_joint_1", "lbr_iiwa_joint_2"])
     assert policy.metadata.command_limit.tolist() == [0.5, 0.5]
-    assert policy.metadata.goal_frame == "lbr_iiwa_link_0"
+    assert policy.metadata.goal.frame == "lbr_iiwa_link_0"

@@ -12,15 +12,18 @@ from physai.artifact import gate, onnx
 from physai.artifact.module import make_deployable, save, script
 from physai.artifact.states import ON_POLICY, States, extreme_states, roll_out
 from physai.deploy import Metadata, read_metadata
-from physai.deploy.metadata import INPUTS, metadata_sha256
+from physai.deploy.metadata import metadata_sha256
 from physai.training.run import TrainedPolicy
+
+COMMAND = "joint_velocity_command"
+KEYS = ("joint_position", "joint_velocity", "goal")
 
 
 @pytest.fixture(scope="module")
 def trained(exported_run):
     actor, env = TrainedPolicy(exported_run, "best").deploy(64, seed=3)
     rollout = roll_out(actor, env)
-    yield actor, env, rollout, States(*(rollout.get(key)[::20] for key in INPUTS))
+    yield actor, env, rollout, States({key: rollout.get(key)[::20] for key in KEYS})
     env.close()
 
 
@@ -49,14 +52,14 @@ def test_the_states_are_those_of_the_policy_at_work(trained):
 
 
 def test_the_extremes_have_joint_limits_far_goals_and_huge_velocities(trained):
-    states = extreme_states(trained[1])
+    states = extreme_states(make_deployable(*trained[:2]), trained[1])
     turns = 4 * torch.pi  # of a joint that turns without end
     for joint, ends in enumerate(torch.tensor([[-turns, turns], [-2.6, 2.6]])):
         for end in ends:
-            assert (states.joint_position[:, joint] == end).any()
-    assert states.goal.norm(dim=1).max() > 5.0
-    assert states.joint_velocity.abs().max() == 250.0
-    assert torch.isfinite(torch.cat(states, dim=1)).all()
+            assert (states["joint_position"][:, joint] == end).any()
+    assert states["goal"].norm(dim=1).max() > 5.0
+    assert states["joint_velocity"].abs().max() == 250.0
+    assert torch.isfinite(torch.cat(list(states.values()), dim=1)).all()
 
 
 def test_an_artifact_is_equal_to_its_policy(check):
@@ -65,27 +68,27 @@ def test_an_artifact_is_equal_to_its_policy(check):
 
 def tamper_with_a_weight(policy):
     with torch.no_grad():
-        policy.network[2].weight[5, 7] += 1e-3
+        policy.pipeline.network[2].weight[5, 7] += 1e-3
 
 
 def forget_the_normalizer(policy):
-    policy.normalizer.loc.zero_()
-    policy.normalizer.scale.fill_(1.0)
+    policy.pipeline.normalizer.loc.zero_()
+    policy.pipeline.normalizer.scale.fill_(1.0)
 
 
 def forget_the_scale(policy):
-    policy.command_limit.fill_(1.0)
+    policy.pipeline.command.scale.fill_(1.0)
 
 
 def swap_the_joints(policy):
     with torch.no_grad():
-        last = policy.network[-2]
+        last = policy.pipeline.network[-2]
         last.weight.copy_(last.weight.flip(0))
         last.bias.copy_(last.bias.flip(0))
 
 
 def swap_the_inputs(policy):
-    policy.seen = policy.seen[::-1]
+    policy.pipeline.seen = policy.pipeline.seen[::-1]
 
 
 class OtherLayout(nn.Module):
@@ -99,20 +102,20 @@ class OtherLayout(nn.Module):
         observation, features = self.inner(q, qd, goal)
         return torch.cat([observation[:, 2:4], observation[:, :2], observation[:, 4:]], dim=1), features
 
-    def distance(self, q, goal):
-        return self.inner.distance(q, goal)
+    def error(self, q, goal):
+        return self.inner.error(q, goal)
 
 
 def change_the_layout(policy):
-    policy.observation = OtherLayout(policy.observation)
+    policy.pipeline.observation = OtherLayout(policy.pipeline.observation)
 
 
 def lengthen_a_link(policy):
-    policy.observation.kinematics.constant[1, 0, 3] += 0.001
+    policy.pipeline.observation.kinematics.constant[1, 0, 3] += 0.001
 
 
-def break_the_distance(policy):
-    policy.observation.distance = lambda q, goal: torch.zeros(len(q), 1)
+def break_the_error(policy):
+    policy.pipeline.observation.error = lambda q, goal: torch.zeros(len(q), 1)
 
 
 @pytest.mark.parametrize(
@@ -125,7 +128,7 @@ def break_the_distance(policy):
         (swap_the_inputs, "joint_velocity_command differs by"),
         (change_the_layout, ": observation differs by"),
         (lengthen_a_link, ": observation differs by"),
-        (break_the_distance, "distance differs by"),
+        (break_the_error, "error differs by"),
     ],
 )
 def test_what_is_planted_is_found_and_named(check, plant, what):
@@ -142,14 +145,14 @@ def test_what_is_planted_is_found_and_named(check, plant, what):
 def test_what_is_planted_in_the_scripted_form_alone_is_found(trained):
     actor, env, _, states = trained
     policy = make_deployable(actor, env)
-    expected = gate.answers(policy, states)
-    policy.observation.kinematics.constant.mul_(0.999)
+    expected = gate.answers(policy, policy, states)
+    policy.pipeline.observation.kinematics.constant.mul_(0.999)
     scripted = script(policy)
-    commands = gate.answers(scripted, states)
+    commands = gate.answers(scripted, policy, states)
     with pytest.raises(gate.GateError, match="a stage: joint_velocity_command differs by"):
         gate.compare_answers("a stage", commands, expected, states)
-    commands[:, :-1] = expected[:, :-1]
-    with pytest.raises(gate.GateError, match="a stage: distance differs by"):
+    commands["joint_velocity_command"] = expected["joint_velocity_command"]
+    with pytest.raises(gate.GateError, match="a stage: error differs by"):
         gate.compare_answers("a stage", commands, expected, states)
 
 
@@ -174,15 +177,29 @@ def other_rate(raw):
 
 
 def other_frame(raw):
-    raw["goal"]["frame"] = "world"
+    raw["inputs"][2]["frame"] = "world"
 
 
 def other_ring(raw):
-    raw["goal"]["radius"] = [0.0, 50.0]
+    raw["goal"]["region"] |= {"inner": 0.0, "outer": 50.0}
 
 
 def other_tolerance(raw):
-    raw["goal"]["tolerance"] = 0.5
+    raw["goal"]["tolerances"][0]["value"] = 0.5
+
+
+def other_bounds(raw):
+    raw["outputs"][0]["high"] = [9.0, 9.0]
+
+
+def other_home(raw):
+    raw["robot"]["home"] = [0.0, 1.0]
+
+
+def other_joints(raw):
+    for labels in (raw["robot"]["joints"], *(one["labels"] for one in raw["inputs"] + raw["outputs"])):
+        if "joint1" in labels:
+            labels.reverse()
 
 
 def other_urdf(raw):
@@ -192,15 +209,17 @@ def other_urdf(raw):
 @pytest.mark.parametrize(
     ("plant", "what"),
     [
-        (lambda raw: raw["robot"]["joints"].reverse(), "joints is"),
+        (other_joints, "joints is"),
+        (other_home, "home is"),
+        (other_bounds, "outputs is"),
         (swap_limits, "position_limit is"),
         (forget_limits, "position_limit is"),
         (raise_the_velocity, "velocity_limit is"),
         (lower_the_command, "command_limit is"),
         (other_rate, "control_rate is 500.0, not 50.0"),
-        (other_frame, "goal_frame is world, not base"),
-        (other_ring, "goal_radius is"),
-        (other_tolerance, "goal_tolerance is"),
+        (other_frame, "inputs is"),
+        (other_ring, "region is"),
+        (other_tolerance, "tolerances is"),
         (other_urdf, "urdf_sha256"),
     ],
 )
@@ -209,25 +228,29 @@ def test_what_is_planted_in_the_metadata_is_found_and_named(trained, exported_ru
     plant(raw)
     metadata = Metadata.parse(json.dumps(raw | {"metadata_sha256": metadata_sha256(raw)}))
     with pytest.raises(gate.GateError, match="the metadata is wrong") as refused:
-        gate.check_metadata(metadata, trained[1].simulation, torch.zeros(1, 3))
+        gate.check_metadata(
+            metadata, trained[1].simulation, make_deployable(*trained[:2]), {COMMAND: torch.zeros(1, 2)}
+        )
     assert what in str(refused.value)
 
 
 def test_a_policy_that_commands_more_than_its_file_says_is_found(trained, exported_run):
     metadata = read_metadata(exported_run / "policy.pt")
-    with pytest.raises(gate.GateError, match="beyond its limit"):
-        gate.check_metadata(metadata, trained[1].simulation, torch.tensor([[0.0, -2.01, 0.1]]))
+    too_much = {COMMAND: torch.tensor([[0.0, -2.01]])}
+    with pytest.raises(gate.GateError, match=r"commands \[0.0, -2.0.*\] rad/s, beyond its limits"):
+        gate.check_metadata(metadata, trained[1].simulation, make_deployable(*trained[:2]), too_much)
 
 
 def test_one_ulp_in_one_weight_is_found_at_batch_one(trained):
     actor, env, rollout, states = trained
     policy = make_deployable(actor, env)
-    before = gate.answers(policy, states)
-    weight = policy.network[-2].weight.detach().view(-1)
+    before = gate.answers(policy, policy, states)
+    weight = policy.pipeline.network[-2].weight.detach().view(-1)
     for index in weight.abs().argsort(descending=True):
         was = weight[index].clone()
         weight[index] = torch.nextafter(was, torch.tensor(torch.inf))
-        if not torch.equal(gate.answers(policy, states), before):
+        now = gate.answers(policy, policy, states)
+        if not torch.equal(now[COMMAND], before[COMMAND]):
             break
         weight[index] = was  # its last bit is lost in the sum with all the others
     with pytest.raises(gate.GateError, match="joint_velocity_command differs by"):
@@ -236,7 +259,7 @@ def test_one_ulp_in_one_weight_is_found_at_batch_one(trained):
 
 def test_a_number_that_is_not_finite_is_a_difference(trained):
     states = trained[3]
-    expected = torch.zeros(len(states.goal), 2)
+    expected = torch.zeros(len(states), 2)
     found = expected.clone()
     found[4, 1] = torch.nan
     with pytest.raises(gate.GateError, match="stage: command differs by inf") as refused:
@@ -249,35 +272,37 @@ def test_a_number_that_is_not_finite_is_a_difference(trained):
 def test_a_fresh_process_without_physai_gives_the_same_bits(trained):
     actor, env, _, states = trained
     policy = make_deployable(actor, env)
-    found = gate.ask_fresh_process(save(script(policy)), states)
-    assert torch.equal(found, gate.answers(policy, states))
+    found = gate.ask_fresh_process(save(script(policy)), policy, states)
+    expected = gate.answers(policy, policy, states)
+    assert list(found) == list(expected)
+    assert all(torch.equal(found[key], expected[key]) for key in expected)
 
 
 def test_a_file_that_a_fresh_process_cannot_run_is_refused(trained):
     with pytest.raises(gate.GateError, match="a fresh process without physai cannot run the file"):
-        gate.ask_fresh_process(b"not a file of torch", trained[3])
+        gate.ask_fresh_process(b"not a file of torch", make_deployable(*trained[:2]), trained[3])
 
 
 def test_onnx_agrees_and_what_is_planted_in_it_is_found(trained):
     actor, env, _, states = trained
     policy = make_deployable(actor, env)
-    expected = gate.answers(policy, states)
+    expected = gate.answers(policy, policy, states)
     content = onnx.convert(policy, states)
-    assert gate.check_onnx(onnx.Runtime(content), expected, states) <= 1e-5
+    assert gate.check_onnx(onnx.Runtime(content), policy, expected, states) <= 1e-5
     wrong = copy.deepcopy(policy)
     tamper_with_a_weight(wrong)
     with pytest.raises(gate.GateError, match=r"ONNX Runtime disagrees \(one by one\): joint_velocity_command differs"):
-        gate.check_onnx(onnx.Runtime(onnx.convert(wrong, states)), expected, states)
+        gate.check_onnx(onnx.Runtime(onnx.convert(wrong, states)), policy, expected, states)
 
 
 def test_an_artifact_that_drives_worse_is_refused(trained):
     actor, env, _, _ = trained
     policy = make_deployable(actor, env)
-    driven = gate.check_drive(save(script(policy)), actor, env, 64, seed=5)
+    driven = gate.check_drive(save(script(policy)), policy, actor, env, 64, seed=5)
     assert driven.success_rate > 0.9
-    policy.command_limit.mul_(-1)
+    policy.pipeline.command.scale.mul_(-1)
     with pytest.raises(gate.GateError, match="does not drive as the policy does: it reaches"):
-        gate.check_drive(save(script(policy)), actor, env, 64, seed=5)
+        gate.check_drive(save(script(policy)), policy, actor, env, 64, seed=5)
 
 
 @pytest.mark.slow
@@ -285,7 +310,7 @@ def test_in_closed_loop_the_artifact_succeeds_as_the_policy_does_on_a_thousand_g
     trained = TrainedPolicy(exported_run, "best")
     actor, env = trained.deploy(1000, seed=11)
     content = (exported_run / "policy.pt").read_bytes()
-    driven = gate.check_drive(content, actor, env, 1000, seed=11)
+    driven = gate.check_drive(content, make_deployable(actor, env), actor, env, 1000, seed=11)
     judged = trained.evaluate(1000, seed=11)
     print(f"artifact {driven.success_rate:.1%}, policy {judged.success_rate:.1%}")
     assert abs(driven.success_rate - judged.success_rate) <= 0.01

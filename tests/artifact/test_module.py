@@ -5,20 +5,24 @@ import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictSequential
 
-from physai.artifact.module import DeployablePolicy, make_deployable, save, script
+from physai.artifact.module import make_deployable, save, script
 from physai.config import compose, validate
 from physai.deploy.archive import content_sha256
 from physai.envs.make import make
 from physai.errors import UserError
 from physai.training.agent import make_actor
 from physai.training.config import TrainConfig
+from physai.transforms import RunningStatistics
 from tests.training.small import SMALL
 
 
 def untrained(*overrides, num_envs=4):
     config = validate(TrainConfig, compose("train", [*SMALL, *overrides]))
-    env = make(config.env.name, num_envs, overrides=["randomization=none"])
-    env.normalization.update(torch.randn(100, env.observation_spec["observation"].shape[-1]) * 2 + 1)
+    given = [one for one in overrides if one.startswith("env.")]
+    env = make(config.env.name, num_envs, overrides=["randomization=none", *given])
+    RunningStatistics(env.normalizer, 0.01).update(
+        torch.randn(100, env.observation_spec["observation"].shape[-1]) * 2 + 1
+    )
     return make_actor(config, env), env
 
 
@@ -35,7 +39,7 @@ def test_scripted_and_eager_agree_to_the_last_bit(env, rows):
     for _ in range(20):
         inputs = sensed(rows)
         assert torch.equal(scripted(*inputs), policy(*inputs))
-        assert torch.equal(scripted.distance(inputs[0], inputs[2]), policy.distance(inputs[0], inputs[2]))
+        assert torch.equal(scripted.error(inputs[0], inputs[2]), policy.error(inputs[0], inputs[2]))
     env.close()
 
 
@@ -70,7 +74,7 @@ def test_it_is_frozen_and_goes_its_own_way():
     before = policy(*inputs)
     with torch.no_grad():
         actor.network[0].weight.add_(1.0)
-    env.normalization.update(torch.full((1000, 8), 100.0))
+    RunningStatistics(env.normalizer, 0.01).update(torch.full((1000, 8), 100.0))
     assert torch.equal(policy(*inputs), before)
     assert not before.requires_grad
     assert not policy.training
@@ -103,15 +107,32 @@ def test_metadata_does_not_change_the_hash_of_code_and_weights():
 
 def test_a_policy_that_sees_the_physics_is_refused_by_name():
     actor, env = untrained()
+    actor.in_keys = ["features", "physics_parameters"]
     with pytest.raises(UserError, match=r"in_keys: a policy that sees 'physics_parameters' cannot be exported"):
-        DeployablePolicy(
-            env.simulation.observation,
-            env.normalization.normalizer,
-            actor.deterministic(),
-            ["features", "physics_parameters"],
-            torch.ones(2),
-        )
+        make_deployable(actor, env)
     env.close()
+
+
+def test_a_policy_that_commands_positions_moves_the_last_command_on():
+    actor, env = untrained("env.robot.command=joint_position")
+    policy = make_deployable(actor, env)
+    assert policy.in_keys == ["joint_position", "joint_velocity", "goal", "last_command"]
+    assert policy.out_keys == ["joint_position_command"]
+    tensordict = env.reset()
+    inputs = [tensordict[key] for key in policy.in_keys]
+    moved = policy(*inputs) - tensordict["last_command"]
+    torch.testing.assert_close(moved, actor(tensordict)["action"] * 2.0 * 0.02, rtol=0, atol=1e-6)
+    env.close()
+
+
+def test_policies_of_both_kinds_script_in_one_process_each_with_its_own_inputs():
+    schemas = []
+    for command in ("joint_velocity", "joint_position", "joint_velocity"):
+        actor, env = untrained(f"env.robot.command={command}")
+        schemas.append([argument.name for argument in script(make_deployable(actor, env)).forward.schema.arguments[1:]])
+        env.close()
+    assert schemas[0] == schemas[2] == ["joint_position", "joint_velocity", "goal"]
+    assert schemas[1] == [*schemas[0], "last_command"]
 
 
 class Unscriptable(torch.nn.Module):

@@ -15,7 +15,7 @@ from physai.deploy import load_policy, read_metadata
 from physai.deploy.policy import load_module
 from physai.training.run import TrainedPolicy
 
-SIZE = 32
+COMMAND, SIZE = "joint_velocity_command", 32
 KEYS = ["joint_position", "joint_velocity", "goal", "memory"]
 
 
@@ -23,37 +23,40 @@ KEYS = ["joint_position", "joint_velocity", "goal", "memory"]
 def trained(recurrent_run):
     actor, env = TrainedPolicy(recurrent_run, "best").deploy(64, seed=3)
     rollout = roll_out(actor, env)
-    yield actor, env, rollout, States(*(rollout.get(key)[::20] for key in KEYS))
+    yield actor, env, rollout, States({key: rollout.get(key)[::20] for key in KEYS})
     env.close()
 
 
 def test_over_a_thousand_steps_each_form_remembers_as_the_policy_does(trained, recurrent_run):
     actor, env, rollout, _ = trained
-    work = States(*(rollout.get(key)[:1000] for key in KEYS))
+    work = States({key: rollout.get(key)[:1000] for key in KEYS})
     content = (recurrent_run / "policy.pt").read_bytes()
-    expected = gate.unroll(gate.acting(actor, env), work)
-    assert expected.shape == (1000, 2 + SIZE)
-    assert expected[-1, 2:].abs().max() > 0.1  # there is something to remember
-    assert torch.equal(gate.unroll(load_module(content, KEYS), work), expected)
+    policy = make_deployable(actor, env)
+    expected = gate.unroll(gate.acting(actor, env), policy, work)
+    assert {key: value.shape for key, value in expected.items()} == {COMMAND: (1000, 2), "new_memory": (1000, SIZE)}
+    assert expected["new_memory"][-1].abs().max() > 0.1  # there is something to remember
+    found = gate.unroll(load_module(content, KEYS), policy, work)
+    assert all(torch.equal(found[key], expected[key]) for key in expected)
     runtime = onnx.Runtime((recurrent_run / "policy.onnx").read_bytes())
-    assert (gate.unroll(runtime, work) - expected).abs().max() < 1e-5
+    found = gate.unroll(runtime, policy, work)
+    assert all((found[key] - expected[key]).abs().max() < 1e-5 for key in expected)
 
 
 def test_without_its_memory_it_would_act_otherwise(trained):
     actor, env, _, states = trained
     policy = make_deployable(actor, env)
-    forgetful = policy(*states.sensed, torch.zeros(len(states.goal), SIZE))[0]
-    assert (policy(*states)[0] - forgetful).abs().max() > 0.05
+    forgetful = policy(*(states | {"memory": torch.zeros(len(states), SIZE)}).values())[0]
+    assert (policy(*states.values())[0] - forgetful).abs().max() > 0.05
 
 
 def test_its_inputs_and_outputs_are_named_in_both_forms_and_in_the_metadata(recurrent_run):
     metadata = read_metadata(recurrent_run / "policy.pt")
     assert metadata.memory_size == SIZE
-    assert metadata.raw["inputs"]["memory"] == metadata.raw["outputs"]["new_memory"] == ["N", SIZE]
+    assert metadata.inputs[-1].shape == metadata.outputs[-1].shape == (SIZE,)
     session = onnxruntime.InferenceSession(recurrent_run / "policy.onnx")
-    assert [node.name for node in session.get_inputs()] == KEYS == list(metadata.inputs)
-    assert [node.name for node in session.get_outputs()] == ["joint_velocity_command", "new_memory"]
-    assert metadata.outputs == ("joint_velocity_command", "new_memory")
+    assert [node.name for node in session.get_inputs()] == KEYS == [one.name for one in metadata.inputs]
+    assert [node.name for node in session.get_outputs()] == [COMMAND, "new_memory"]
+    assert [signal.name for signal in metadata.outputs] == [COMMAND, "new_memory"]
     assert json.loads(onnx.read_metadata((recurrent_run / "policy.onnx").read_bytes())) == metadata.raw
 
 
@@ -75,19 +78,21 @@ def test_golden_pairs_have_a_memory_before_and_after(recurrent_run):
 
 
 def forget(policy):
-    policy.network.forward = lambda seen, memory: type(policy.network).forward(policy.network, seen, memory * 0)
+    policy.pipeline.network.forward = lambda seen, memory: type(policy.pipeline.network).forward(
+        policy.pipeline.network, seen, memory * 0
+    )
 
 
 def keep_the_old_memory(policy):
-    policy.network.forward = lambda seen, memory: (
-        type(policy.network).forward(policy.network, seen, memory)[0],
+    policy.pipeline.network.forward = lambda seen, memory: (
+        type(policy.pipeline.network).forward(policy.pipeline.network, seen, memory)[0],
         memory,
     )
 
 
 def tamper_with_the_cell(policy):
     with torch.no_grad():
-        policy.network.cell.weight_hh[3, 4] += 1e-3
+        policy.pipeline.network.cell.weight_hh[3, 4] += 1e-3
 
 
 @pytest.mark.parametrize(
@@ -107,23 +112,25 @@ def test_what_is_planted_in_its_memory_is_found_and_named(trained, plant, what):
     assert what in str(refused.value)
     assert "memory=[" in str(refused.value)
     with pytest.raises(gate.GateError, match="the artifact remembers otherwise: "):
-        gate.check_recurrence({"the artifact": (policy, 0.0)}, gate.acting(actor, env), states)
+        gate.check_recurrence({"the artifact": (policy, 0.0)}, gate.acting(actor, env), policy, states)
 
 
 def test_all_stages_of_the_gate_see_its_memory(trained):
     actor, env, rollout, states = trained
     policy = make_deployable(actor, env)
-    states = States(*map(torch.cat, zip(states, extreme_states(env, SIZE), strict=True)))
+    extremes = extreme_states(policy, env)
+    states = States({key: torch.cat([states[key], extremes[key]]) for key in KEYS})
     gate.check_against_env(policy, actor, env, rollout, states)
-    expected, content = gate.answers(policy, states), save(script(policy))
-    assert expected.shape == (len(states.goal), 2 + SIZE + 1)
-    assert torch.equal(gate.ask_fresh_process(content, states), expected)
-    wrong = expected.clone()
-    wrong[7, 2 + 5] += 1e-6
+    expected, content = gate.answers(policy, policy, states), save(script(policy))
+    assert list(expected) == [COMMAND, "new_memory", "error"]
+    found = gate.ask_fresh_process(content, policy, states)
+    assert all(torch.equal(found[key], expected[key]) for key in expected)
+    wrong = expected | {"new_memory": expected["new_memory"].clone()}
+    wrong["new_memory"][7, 5] += 1e-6
     with pytest.raises(gate.GateError, match=r"a stage: new_memory differs by .* memory=\["):
         gate.compare_answers("a stage", wrong, expected, states)
     other = copy.deepcopy(policy)
     tamper_with_the_cell(other)
     with pytest.raises(gate.GateError, match="ONNX Runtime disagrees"):
-        gate.check_onnx(onnx.Runtime(onnx.convert(other, states)), expected, states)
-    assert gate.check_drive(content, actor, env, 64, seed=5).success_rate > 0.9
+        gate.check_onnx(onnx.Runtime(onnx.convert(other, states)), policy, expected, states)
+    assert gate.check_drive(content, policy, actor, env, 64, seed=5).success_rate > 0.9

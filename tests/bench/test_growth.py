@@ -8,13 +8,13 @@ from physai.bench import growth
 
 @pytest.mark.slow
 def test_runs_are_measured_drawn_and_shown(monkeypatch, tmp_path):
-    monkeypatch.setattr(growth, "FRAMES", (2048, 6144))
+    monkeypatch.setattr(growth, "FRAMES", (6144,))
     monkeypatch.setattr(growth, "ROBOTS", (64,))
     monkeypatch.setattr(growth, "ROBOTS_FRAMES", 2048)
-    by_frames, by_robots = growth.measure_growth(seed=0)
-    assert [run.frames for run in by_frames] == [2048, 6144]
-    assert by_frames[1].seconds > by_frames[0].seconds > 0
-    assert 100 < by_robots[0].megabytes < by_frames[0].megabytes < 10_000
+    ((more,), (less,)) = by_frames, by_robots = growth.measure_growth(seed=0)
+    assert (more.frames, less.frames, less.robots) == (6144, 2048, 64)
+    assert 0 < less.seconds < more.seconds
+    assert 100 < less.megabytes < more.megabytes < 10_000
     growth.growth_figure(by_frames, by_robots, tmp_path / "new" / "growth.png")
     assert (tmp_path / "new" / "growth.png").stat().st_size > 10_000
     console = Console(width=120, record=True)

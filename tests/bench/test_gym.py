@@ -23,7 +23,7 @@ def test_the_env_written_by_hand_is_a_gymnasium_env(by_hand):
 
 
 def test_the_env_written_by_hand_is_the_same_task_as_physai_s(by_hand):
-    ours = gymnasium.make(gym.NAME, overrides=["env.task.start_spread=[0.0,0.0]"])
+    ours = gymnasium.make(gym.NAME, overrides=["env.start.spread=[0.0,0.0]"])
     simulation = ours.unwrapped.simulation
     by_hand.spread = [0.0, 0.0]
     by_hand.reset(seed=0)
@@ -45,10 +45,10 @@ def test_both_comparisons_are_measured_and_shown(monkeypatch):
     for name, value in {"ROBOTS": 3, "ROUNDS": 2, "STEPS": 50, "STEPS_OF_ALL": 5}.items():
         monkeypatch.setattr(gym, name, value)
     speeds = gym.measure_gym(seed=0)
-    assert [len(sides) for sides in speeds] == [2, 3]
+    assert [len(sides) for sides in speeds] == [2, 2]
     assert all(min(sides) > 0 for sides in speeds)
     console = Console(width=120, record=True)
     console.print(gym.gym_table(*speeds))
     shown = console.export_text()
-    for part in ("one robot", "by hand", "3 robots", "3 robots, processes=1", "DummyVecEnv", "ratio"):
+    for part in ("one robot", "by hand", "3 robots", "DummyVecEnv", "ratio"):
         assert part in shown

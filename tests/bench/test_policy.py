@@ -1,5 +1,7 @@
 """The measurement of single commands runs, and shows every form of a policy."""
 
+import shutil
+
 import pytest
 from rich.console import Console
 
@@ -7,8 +9,11 @@ from physai.bench import policy
 
 
 @pytest.mark.slow
-def test_every_form_is_timed_and_shown(monkeypatch):
-    monkeypatch.setattr(policy, "FRAMES", 2048)
+def test_every_form_is_timed_and_shown(monkeypatch, exported_run, recurrent_run):
+    exported = {"mlp": exported_run, "gru": recurrent_run}  # how it makes them: tests/bench/test_ros.py
+    monkeypatch.setattr(
+        policy, "make_run", lambda run, *_: shutil.copytree(exported[run.name], run, dirs_exist_ok=True)
+    )
     monkeypatch.setattr(policy, "ROUNDS", 2)
     monkeypatch.setattr(policy, "CALLS", 20)
     times, load = policy.measure_policy(seed=0)

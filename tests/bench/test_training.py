@@ -47,12 +47,12 @@ def actions(steps):
 
 
 def test_an_episode_is_the_one_of_the_gymnasium_vector_env(make):
-    envs, twin = make(SHORT), RobotVectorEnv("reacher", ROBOTS, overrides=[SHORT])
-    envs.simulation.task.tolerance = twin.simulation.task.tolerance = 0.3  # so that some reach their goal
+    near = "env.task.tolerance=0.3"  # so that some reach their goal
+    envs, twin = make(SHORT, near), RobotVectorEnv("reacher", ROBOTS, overrides=[SHORT, near])
     envs.seed(0)
     envs.reset()
     twin.reset()
-    twin.simulation.set_state(envs.simulation.state())
+    twin.simulation.restore(envs.simulation.snapshot())
     going, ends = np.ones(ROBOTS, bool), []
     for action in actions(20):
         observation, reward, done, infos = envs.step(action)
@@ -82,7 +82,7 @@ def test_a_row_that_is_done_starts_anew_in_the_same_step(make):
     assert (envs.simulation.episode_length[done] == 0).all()
     for row in done.nonzero()[0]:
         assert (observation[row, 2:4] == 0).all()  # at rest
-        np.testing.assert_array_equal(observation[row, 6:], envs.simulation.goal[row])
+        np.testing.assert_array_equal(observation[row, 6:], envs.simulation.goal[row].astype(np.float32))
         assert not np.allclose(infos[row]["terminal_observation"][6:], observation[row, 6:])
     assert not np.array_equal(goals, envs.simulation.goal)
 
@@ -94,9 +94,9 @@ def test_observations_are_those_of_the_task_where_a_joint_turns_around(make, fea
     for _ in range(190):
         observation = envs.step(np.ones((ROBOTS, 2), np.float32))[0]
     now = envs.simulation
-    assert now.joint_position[:, 0].max() > 4  # more than half a turn
-    sensed = (torch.from_numpy(value) for value in (now.joint_position, now.joint_velocity, now.goal))
-    expected = torch.cat(now.observation(*sensed)[: 1 + features], dim=1).numpy()
+    assert now.state.joint_position[:, 0].max() > 4  # more than half a turn
+    sensed = (torch.from_numpy(v).float() for v in (now.state.joint_position, now.state.joint_velocity, now.goal))
+    expected = torch.cat(now.task.module(*sensed)[: 1 + features], dim=1).numpy()
     np.testing.assert_allclose(observation, expected, atol=2e-6)
     assert all(envs.observation_space.contains(row) for row in observation)
 
@@ -194,7 +194,7 @@ def test_who_does_not_arrive_is_ahead_of_nobody():
 @pytest.mark.slow
 def test_all_learners_race(monkeypatch):
     monkeypatch.setattr(training, "GOALS", 20)
-    monkeypatch.setattr(training, "JUDGE_EVERY", 4096)
+    monkeypatch.setattr(training, "JUDGE_EVERY", 1024)
     reacher = training.reacher
     monkeypatch.setattr(
         training, "reacher", lambda seed, *overrides: reacher(seed, *overrides, SHORT, "total_frames=4096")

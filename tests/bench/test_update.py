@@ -14,7 +14,7 @@ def test_ppo_by_hand_learns_what_algo_ppo_learns():
     config = reacher(0, "collector.num_envs=32", "collector.frames_per_batch=512", "algo.minibatch_size=512")
     agent, twin = Agent.build(config), Agent.build(config)
     batch = next(iter(agent.collector))
-    agent.env.normalization.update(batch["observation"])
+    agent.statistics.update(batch["observation"])
     before = [value.clone() for value in agent.actor.parameters()]
     frames = update.plain_ppo(twin, batch.clone(), config.algo)()
     agent.algorithm.update(batch)

@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from physai.collectors import make_collector
+from physai.transforms import RunningStatistics
 from tests.collectors import parts
 
 
@@ -14,7 +15,7 @@ def collector(frames=256, total=1024, seed=0):
 
 def test_one_set_of_statistics_holds_for_a_whole_batch():
     source = collector()
-    normalization = source.env.normalization
+    normalization = RunningStatistics(source.env.normalizer, 0.01)
     for batch in source:
         expected = normalization.normalizer(batch["observation"])
         assert torch.equal(batch["normalized_observation"], expected)
@@ -54,7 +55,7 @@ def test_memory_stays_flat_while_frames_go_by():
     source = collector(frames=1600, total=160_000)
     sizes = []
     for batch in source:
-        source.env.normalization.update(batch["observation"])
+        RunningStatistics(source.env.normalizer, 0.01).update(batch["observation"])
         sizes.append(resident_megabytes())
     source.shutdown()
     assert max(sizes[60:]) - sizes[40] < 5  # 1 kB kept per 20 frames would show

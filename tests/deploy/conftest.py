@@ -1,16 +1,13 @@
-"""What the tests of deployment share: the real policy, and one that misbehaves on demand."""
+"""What the tests of deployment share: the real policy, its file, and an arm under a controller."""
 
-import math
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 import pytest
 
 from physai.deploy import Policy, load_policy
 
-pytest.register_assert_rewrite("tests.deploy.world")
+for helper in ("files", "hearing", "robot", "targets", "world"):
+    pytest.register_assert_rewrite(f"tests.deploy.{helper}")
 
 
 @pytest.fixture(scope="session")
@@ -19,67 +16,10 @@ def policy(exported_run) -> Policy:
     return load_policy(exported_run / "policy.pt")
 
 
-def _raise(command: np.ndarray) -> None:
-    raise RuntimeError("the network is gone")
-
-
-FAILURES: dict[str, Callable[[np.ndarray], Any]] = {
-    "NaN": lambda command: command * math.nan,
-    "one NaN": lambda command: np.array([0.1, math.nan]),
-    "infinite": lambda command: np.array([math.inf, 0.0]),
-    "wrong shape": lambda command: command[:1],
-    "a row too much": lambda command: command[None],
-    "nothing": lambda command: None,
-    "text": lambda command: "stop",
-    "exception": _raise,
-    "slow": lambda command: command,
-}
-DISTANCES = {"distance NaN": math.nan, "distance infinite": math.inf, "distance negative": -0.01}
-ALL_FAILURES = (*FAILURES, *DISTANCES)
-
-
-class Troubled:
-    """A policy that answers as the one inside, unless ``trouble`` is one of ALL_FAILURES or a function of its command.
-
-    With the trouble "emergency stop" it calls ``stop``, too. Its stopwatch stands still but for slow answers.
-    """
-
-    def __init__(self, policy: Any) -> None:
-        self.policy, self.metadata, self.sha256 = policy, policy.metadata, policy.sha256
-        self.trouble: str | Callable[[np.ndarray], Any] | None = None
-        self.stop: Callable[[], None] | None = None
-        self.seconds = 0.0
-        self.forget()
-
-    def forget(self) -> None:
-        self.measured: float | None = None
-        self.called = self.failed = self.stopped = False
-
-    def stopwatch(self) -> float:
-        return self.seconds
-
-    def distance(self, joint_position: np.ndarray, goal: np.ndarray) -> float:
-        self.goal = goal
-        if self.trouble in DISTANCES:
-            self.failed = True
-            return DISTANCES[self.trouble]
-        self.measured = self.policy.distance(joint_position, goal)
-        return self.measured
-
-    def __call__(self, joint_position: np.ndarray, joint_velocity: np.ndarray, goal: np.ndarray) -> Any:
-        self.called = True
-        command = self.policy(joint_position, joint_velocity, goal)
-        if self.trouble is None:
-            return command
-        if not isinstance(self.trouble, str):
-            return self.trouble(command)
-        if self.trouble == "emergency stop":
-            self.stopped = True
-            self.stop()
-            return command
-        self.failed = True
-        self.seconds += self.trouble == "slow"
-        return FAILURES[self.trouble](command)
+@pytest.fixture(scope="session")
+def position_policy(position_run) -> Policy:
+    """The same, of an arm that is driven by positions."""
+    return load_policy(position_run / "policy.pt")
 
 
 @pytest.fixture(scope="session")
@@ -90,3 +30,18 @@ def content(exported_run) -> bytes:
 @pytest.fixture
 def path(tmp_path) -> Path:
     return tmp_path / "policy.pt"
+
+
+@pytest.fixture
+def robot(policy):
+    """An arm that stays where it is put."""
+    from tests.deploy.robot import Robot
+
+    return Robot(policy)
+
+
+@pytest.fixture
+def moving(robot):
+    """The same, at full speed."""
+    robot.drive()
+    return robot

@@ -2,11 +2,16 @@
 
 import io
 import json
+import subprocess
+import sys
 import zipfile
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
 from physai.deploy import Policy, PolicyError, load_policy
 from physai.deploy.archive import content_sha256
@@ -47,5 +52,53 @@ def sign(records: dict[str, bytes]) -> dict[str, bytes]:
     return records | {METADATA: json.dumps(metadata).encode()}
 
 
+def described(content: bytes, change: Callable[[dict[str, Any]], object]) -> bytes:
+    """The file with changed metadata."""
+    good = records(content)
+    metadata = json.loads(good[METADATA])
+    change(metadata)
+    return pack(sign(good | {METADATA: json.dumps(metadata).encode()}))
+
+
+def save(scripted: torch.jit.ScriptModule, metadata: str | None = None) -> bytes:
+    """The content of a policy file."""
+    written = io.BytesIO()
+    torch.jit.save(scripted, written, _extra_files=None if metadata is None else {"metadata.json": metadata})
+    return pack({name: data for name, data in records(written.getvalue()).items() if not name.endswith(".debug_pkl")})
+
+
 def commands(policy: Policy, golden: dict[str, np.ndarray]) -> np.ndarray:
     return np.array([policy(*inputs) for inputs in zip(*(golden[key] for key in GOLDEN), strict=True)])
+
+
+def refused_or_unchanged(path: Path, original: Policy) -> bool:
+    """Whether a file is refused; one that is not must be the original in all but the look of its zip."""
+    try:
+        policy = load_policy(path)
+    except PolicyError:
+        refusal(path)
+        return True
+    golden = original.metadata.golden
+    assert policy.golden_error == 0.0
+    assert np.array_equal(commands(policy, golden), golden["joint_velocity_command"])
+    assert policy.metadata.raw == original.metadata.raw
+    return False
+
+
+LOAD = """
+import sys
+from physai.deploy import PolicyError, load_policy
+for path in sys.argv[1:]:
+    try:
+        print("loaded:", load_policy(path).golden_error)
+    except PolicyError as error:
+        print("refused:", error)
+"""
+
+
+def load_elsewhere(*paths: Path, program: str = LOAD) -> list[str]:
+    done = subprocess.run(
+        [sys.executable, "-c", program, *map(str, paths)], capture_output=True, text=True, timeout=120
+    )
+    assert done.returncode == 0, f"exit code {done.returncode}: {done.stderr[-500:]}"
+    return done.stdout.splitlines()

@@ -11,10 +11,10 @@ import torch
 from physai.config import compose, validate
 from physai.deploy import Controller, ControllerConfig, Goal, JointState, State
 from physai.deploy.following import Following
-from physai.physics import ParameterLayout, RandomizationConfig
+from physai.physics import ParameterLayout, RandomizationConfig, RobotState
 from physai.physics.pybullet import PyBulletPhysics
 from physai.robots import RobotSpec
-from tests.deploy.conftest import Troubled
+from tests.deploy.troubled import Troubled
 
 PERIOD = 0.02
 NAMES = ("joint1", "joint2")
@@ -48,7 +48,7 @@ class Arm:
         self.position = self.position + velocity * PERIOD
         values = self.show(names=NAMES, position=self.position, velocity=velocity, stamp=self.now)
         command = self.controller.update(self.now, JointState(**values), goal, interlocks)
-        self.commands.append(np.zeros(2) if command.velocity is None else command.velocity)
+        self.commands.append(np.zeros(2) if command.value is None else command.value)
         return command
 
     def run(self, seconds, goal=None):
@@ -60,9 +60,9 @@ class Arm:
     def fault(self, goal=FAR_GOAL):
         """Drive until a fault; return how long it took from the first command on, and what was said."""
         commands = self.run(2.0, goal)
-        began = next(tick for tick, command in enumerate(commands) if command.velocity is not None)
+        began = next(tick for tick, command in enumerate(commands) if command.value is not None)
         assert commands[-1].state is State.FAULT, commands[-1]
-        assert commands[-1].velocity.tolist() == [0.0, 0.0]
+        assert commands[-1].value.tolist() == [0.0, 0.0]
         return next(t for t, c in enumerate(commands) if c.state is State.FAULT) * PERIOD - began * PERIOD, (
             commands[-1].reasons[-1]
         )
@@ -185,7 +185,7 @@ def test_states_that_come_seldom_and_not_on_time_are_measured_at_their_own_time(
     speed = np.array([2.0, -0.5])
     for tick in range(100):
         now = tick * PERIOD
-        following.commanded(now, speed)
+        following.commanded(now, speed * PERIOD)
         if tick % every == every - 1:
             motion = np.concatenate([speed * (now - age), speed])
             assert following.heard(now - age, motion) is None
@@ -220,7 +220,7 @@ def test_velocities_that_contradict_positions_are_refused_and_hold(policy, joint
     arm.show = lambda velocity, **values: values | {"velocity": one(joint, change)(velocity)}
     commands = arm.run(0.6, FAR_GOAL)
     held = next(command for command in commands if command.state is State.HOLD)
-    assert held.velocity.tolist() == [0.0, 0.0]
+    assert held.value.tolist() == [0.0, 0.0]
     assert held.reasons[0].startswith(f"joint state rejected: '{NAMES[joint]}' reports velocities for ")
     assert arm.counters["states rejected: velocity inconsistent"] == 1
 
@@ -298,11 +298,12 @@ def simulate(policy, reacher, robots, seconds, randomization, seed, change=None)
     if change is not None:
         change(dynamics)
     physics = PyBulletPhysics(spec, robots, PERIOD / 2)
-    physics.reset(np.arange(robots), start, np.zeros((robots, 2)), dynamics)
+    physics.reset(np.arange(robots), RobotState(start, np.zeros((robots, 2))), dynamics)
     controllers = [Controller(policy, stopwatch=lambda: 0.0) for _ in range(robots)]
     sent, late = np.zeros((7, robots, 2)), np.round(2 * delay[:, 0]).astype(int)
     for tick in range(round(seconds / PERIOD)):
-        position, velocity = physics.joint_state()
+        state = physics.robot_state()
+        position, velocity = state.joint_position, state.joint_velocity
         position = position + offset + shaky * draw.standard_normal((robots, 2))
         velocity = velocity + jerky * draw.standard_normal((robots, 2))
         commands = np.zeros((robots, 2))
@@ -312,7 +313,7 @@ def simulate(policy, reacher, robots, seconds, randomization, seed, change=None)
                 angle, radius = draw.uniform(-3.1, 3.1), draw.uniform(0.31, 0.52)
                 goal = Goal([radius * math.cos(angle), radius * math.sin(angle)], "base")
             state = JointState(NAMES, position[row].tolist(), velocity[row].tolist(), tick * PERIOD)
-            commands[row] = controller.update(tick * PERIOD, state, goal).velocity
+            commands[row] = controller.update(tick * PERIOD, state, goal).value
         for _ in range(2):
             sent = np.concatenate([commands[None], sent[:-1]])
             physics.step(sent[late, np.arange(robots)])

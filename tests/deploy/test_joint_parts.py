@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from physai.deploy import Controller, ControllerConfig, Goal, JointState, State
-from tests.deploy.conftest import Troubled
-from tests.deploy.test_controller import FAR_GOAL, LENIENT, Robot, is_stopped
+from tests.deploy.robot import FAR_GOAL, LENIENT, Robot, is_stopped
+from tests.deploy.troubled import Troubled
 
 PERIOD = 0.02
 NAMES = ("joint1", "joint2")
@@ -40,7 +40,7 @@ class Arm:
 
     def send(self, states, goal=None):
         command = self.controller.update(self.now, states, goal)
-        self.velocity = np.zeros(2) if command.velocity is None else command.velocity
+        self.velocity = np.zeros(2) if command.value is None else command.value
         return command
 
     def run(self, seconds, *messages, goal=None):
@@ -151,7 +151,7 @@ def test_one_joint_of_two_that_goes_silent_holds_and_is_named(policy, joint):
 def test_before_all_joints_are_known_it_waits_sends_nothing_and_says_which_is_missing(policy, joint):
     arm = Arm(policy)
     for command in arm.run(0.5, (NAMES[joint],), goal=FAR_GOAL):
-        assert command.velocity is None
+        assert command.value is None
         assert command.state is State.WAITING
         assert command.reasons == (f"no state of '{NAMES[1 - joint]}' yet",)
     assert arm.tick(NAMES[1 - joint :][:1]).state is State.ACTIVE
@@ -201,7 +201,7 @@ def test_a_robot_that_was_silent_for_3_s_and_is_back_elsewhere_does_not_move_bef
     assert command.reasons[0] == "goal forgotten: the robot was silent for 3.0 s"
     assert arm.counters["goals forgotten: silent"] == 1
     commands = arm.run(2.0)
-    assert not any(command.velocity.any() for command in commands)
+    assert not any(command.value.any() for command in commands)
     assert commands[-1].reasons == ("no goal yet",)
     assert arm.tick(goal=FAR_GOAL).state is State.ACTIVE
 
@@ -236,7 +236,7 @@ def test_another_source_of_joint_states_forgets_the_goal(policy, messages):
     assert command.reasons[0].endswith("' is told by another source than before")
     assert arm.counters["goals forgotten: another source"] == arm.counters["holds: another source"] == 1
     commands = arm.run(1.0, *messages)
-    assert not any(command.velocity.any() for command in commands)
+    assert not any(command.value.any() for command in commands)
     assert is_stopped(commands[-1], State.WAITING)
     assert arm.tick(*messages, goal=FAR_GOAL).state is State.ACTIVE
 
@@ -278,13 +278,13 @@ def test_beyond_a_limit_it_is_slow_at_once_and_keeps_its_direction_however_littl
     robot.policy.trouble = lambda command: np.array([2.0, -1.0])
     robot.position = [0.0, 2.59]
     robot.tick(goal=FAR_GOAL)
-    before = robot.ticks(300)[-1].velocity
+    before = robot.ticks(300)[-1].value
     np.testing.assert_allclose(
         before, [0.6 if acceleration < 1 else 1.0, -0.3 if acceleration < 1 else -0.5], rtol=0.01
     )
     robot.position = [0.0, 2.61]
     for command in robot.ticks(20):
-        np.testing.assert_allclose(command.velocity, [0.05, -0.025], rtol=1e-6)
+        np.testing.assert_allclose(command.value, [0.05, -0.025], rtol=1e-6)
         assert command.reasons[-1] == "a joint is beyond its position limit: slow"
 
 

@@ -24,7 +24,7 @@ def limits(metadata):
 
 
 def reasoned(limits, wanted, position=MIDDLE, last=STILL, elapsed=EVER):
-    return limits.apply(np.array(wanted), np.array(position), np.array(last), elapsed)
+    return limits.apply(np.array(wanted), np.array(position), np.array(position), np.array(last), elapsed)
 
 
 def apply(*arguments, **keywords):

@@ -1,13 +1,14 @@
 """Policies that remember, on a robot: what is loaded, what is refused, and when the controller begins anew."""
 
-import json
 import math
 
 import numpy as np
 import pytest
 
 from physai.deploy import Controller, ControllerConfig, Goal, JointState, State, load_policy
-from tests.deploy.files import METADATA, pack, records, refusal, sign
+from physai.deploy.metadata import describe_signal
+from physai.signals import Quantity, Signal
+from tests.deploy.files import described, refusal
 
 PERIOD, SIZE = 0.02, 32
 GOAL, OTHER_GOAL = Goal([-0.4, -0.1], "base"), Goal([-0.1, -0.4], "base")
@@ -33,7 +34,7 @@ def test_a_policy_that_remembers_takes_and_gives_a_memory(recurrent, policy):
     for wrong in ((), (np.zeros(SIZE - 1),), (np.zeros((1, SIZE)),), (0.0,)):
         with pytest.raises((TypeError, ValueError)):
             recurrent([0.1, 0.2], [0.0, 0.0], [0.4, 0.0], *wrong)
-    with pytest.raises(ValueError, match="0 values are needed"):
+    with pytest.raises(ValueError, match="3 inputs are needed, not 4"):
         policy([0.1, 0.2], [0.0, 0.0], [0.4, 0.0], [0.0])
     assert policy.metadata.memory_size == 0
 
@@ -44,27 +45,21 @@ def test_in_torchrl_code_it_has_its_keys(recurrent):
     assert module.out_keys == ["joint_velocity_command", "new_memory"]
 
 
-def change(content, edit):
-    parts = records(content)
-    metadata = json.loads(parts[METADATA])
-    edit(metadata)
-    return pack(sign(parts | {METADATA: json.dumps(metadata).encode()}))
-
-
 def set_size(size):
     def edit(metadata):
-        metadata["inputs"]["memory"] = metadata["outputs"]["new_memory"] = size
+        for side in ("inputs", "outputs"):
+            metadata[side][-1]["shape"] = size
 
     return edit
 
 
 def forget_the_output(metadata):
-    del metadata["outputs"]["new_memory"]
+    metadata["outputs"].pop()
 
 
 def forget_the_memory(metadata):
-    for part, key in (("inputs", "memory"), ("outputs", "new_memory")):
-        del metadata[part][key]
+    for side in ("inputs", "outputs"):
+        metadata[side].pop()
 
 
 def other_golden_memory(key):
@@ -81,32 +76,34 @@ def golden_nan(metadata):
 @pytest.mark.parametrize(
     ("edit", "message"),
     [
-        (set_size(["N", 0]), "inputs.memory must be ['N', H]"),
-        (set_size(["N", True]), "inputs.memory must be ['N', H]"),
-        (set_size(["N", 10**9]), "inputs.memory must be ['N', H]"),
-        (set_size(32), "inputs.memory must be ['N', H]"),
-        (set_size(["N", 31]), "golden.memory must have the shape [32, 31], not [32, 32]"),
-        (forget_the_output, "outputs must be ['joint_velocity_command', 'new_memory']"),
-        (lambda metadata: metadata["inputs"].pop("memory"), "outputs must be ['joint_velocity_command']"),
+        (set_size([0]), "inputs.3.shape must be positive integers"),
+        (set_size([True]), "inputs.3.shape must be positive integers"),
+        (set_size([10**9]), "inputs.3.shape must be positive integers"),
+        (set_size([60000, 60000]), "inputs.3 has 3,600,000,000 numbers, more than 65,536"),
+        (set_size(32), "inputs.3.shape must be a list"),
+        (set_size([31]), "golden.memory must have the shape [32, 31], not [32, 32]"),
+        (forget_the_output, "there is 'memory' among the inputs, and no 'new_memory' among the outputs"),
+        (lambda metadata: metadata["inputs"].pop(), "a policy that remembers takes 'memory' and gives as much"),
         (forget_the_memory, "its forward takes ['joint_position', 'joint_velocity', 'goal', 'memory'], not"),
         (lambda metadata: metadata["golden"].pop("memory"), "golden.memory is missing"),
         (golden_nan, "golden.new_memory must be finite"),
         (other_golden_memory("memory"), "a golden pair differs by"),
-        (other_golden_memory("new_memory"), "a golden pair differs by 0.01 in new_memory"),
+        (other_golden_memory("new_memory"), "the new_memory of a golden pair differs by 0.01"),
     ],
 )
 def test_metadata_that_do_not_fit_its_memory_are_refused(recurrent_content, path, edit, message):
-    path.write_bytes(change(recurrent_content, edit))
+    path.write_bytes(described(recurrent_content, edit))
     assert message in refusal(path)
 
 
 def test_a_policy_without_memory_that_claims_one_is_refused(content, path):
     def claim(metadata):
-        set_size(["N", 1])(metadata)
+        for side, name in (("inputs", "memory"), ("outputs", "new_memory")):
+            metadata[side].append(describe_signal(Signal(name, Quantity.MEMORY, (1,))))
         pairs = len(metadata["golden"]["goal"])
         metadata["golden"] |= {"memory": [[0.0]] * pairs, "new_memory": [[0.0]] * pairs}
 
-    path.write_bytes(change(content, claim))
+    path.write_bytes(described(content, claim))
     assert "its forward takes ['joint_position', 'joint_velocity', 'goal'], not" in refusal(path)
 
 
@@ -115,7 +112,7 @@ class Recorder:
 
     def __init__(self, policy):
         self.policy, self.metadata, self.sha256 = policy, policy.metadata, policy.sha256
-        self.distance, self.given, self.trouble = policy.distance, [], None
+        self.error, self.given, self.trouble = policy.error, [], None
 
     def __call__(self, joint_position, joint_velocity, goal, memory):
         self.given.append(np.array(memory))
@@ -167,7 +164,7 @@ def test_the_memory_begins_with_zeros_and_goes_on_from_tick_to_tick(recurrent):
     memory = np.zeros(SIZE, np.float32)
     for given in robot.policy.given:
         assert np.array_equal(given, memory)
-        _, memory = recurrent(robot.position, [0.0, 0.0], GOAL.position, memory)
+        _, memory = recurrent(robot.position, [0.0, 0.0], GOAL.value, memory)
 
 
 def hold(robot):
@@ -229,7 +226,7 @@ def test_after_whatever_is_not_driving_the_memory_begins_anew(robot, interrupt):
 
 def test_a_new_goal_begins_a_new_memory_and_the_same_goal_again_does_not(robot):
     assert robot.asked_next(goal=GOAL).any()
-    nearly = Goal([x + 0.001 for x in GOAL.position], "base")
+    nearly = Goal([x + 0.001 for x in GOAL.value], "base")
     assert robot.asked_next(goal=nearly).any()
     assert robot.asked_next(goal=Goal([9.0, 9.0], "base")).any()  # refused: the old one stays
     assert not robot.asked_next(goal=OTHER_GOAL).any()
@@ -250,7 +247,7 @@ def test_a_memory_that_is_none_is_a_failure_with_zero_velocity_and_thrice_a_faul
     robot.policy.trouble = trouble
     for _ in range(3):
         command = robot.tick()
-        assert command.velocity.tolist() == [0.0, 0.0]
+        assert command.value.tolist() == [0.0, 0.0]
         assert reason in " ".join(command.reasons)
     assert command.state is State.FAULT
 
@@ -258,8 +255,8 @@ def test_a_memory_that_is_none_is_a_failure_with_zero_velocity_and_thrice_a_faul
 def test_a_memory_that_is_spoilt_from_outside_never_moves_the_arm(robot):
     robot.controller._memory = np.full(SIZE, math.nan, np.float32)
     command = robot.tick()
-    assert command.velocity.tolist() == [0.0, 0.0]
-    assert "the policy gave a velocity that is not finite" in command.reasons
+    assert command.value.tolist() == [0.0, 0.0]
+    assert "the policy gave a command that is not finite" in command.reasons
     assert not robot.asked_next().any()
 
 

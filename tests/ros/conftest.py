@@ -102,7 +102,7 @@ def start_robot(start: Callable[..., Process]) -> Callable[..., Process]:
 
     def start_robot(*args: str, **parameters: Any) -> Process:
         robot = start("virtual_robot", *args, **parameters)
-        robot.says("takes velocities", 60.0)
+        robot.says("takes joint_velocity", 60.0)
         return robot
 
     return start_robot

@@ -5,7 +5,6 @@ it, and it ends with its input.
 """
 
 import contextlib
-import ctypes
 import importlib
 import json
 import os
@@ -18,9 +17,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from physai.processes import die_with
 from tests.ros.peer import Process, node_command, wait_for
-
-_PR_SET_PDEATHSIG = 1
 
 
 class Forge:
@@ -153,8 +151,8 @@ def _report(*_: Any) -> None:
         os.write(1, f"ended {pid} {os.waitstatus_to_exitcode(status)}\n".encode())
 
 
-def _become(order: dict[str, Any]) -> None:
-    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+def _become(order: dict[str, Any], forge: int) -> None:
+    die_with(forge)
     os.setsid()
     signal.signal(signal.SIGCHLD, signal.SIG_DFL)
     log = os.open(order["log"], os.O_WRONLY | os.O_APPEND)
@@ -168,13 +166,14 @@ def _become(order: dict[str, Any]) -> None:
 
 def _forge() -> None:
     importlib.import_module("physai.ros.inference_node")
+    forge = os.getpid()
     signal.signal(signal.SIGCHLD, _report)
     for line in iter(sys.stdin.readline, ""):
         signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGCHLD])  # "started" comes first
         pid = os.fork()
         if not pid:
             signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGCHLD])
-            _become(json.loads(line))
+            _become(json.loads(line), forge)
         os.write(1, f"started {pid}\n".encode())
         signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGCHLD])
 

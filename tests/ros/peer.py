@@ -1,7 +1,6 @@
 """The other side of the nodes under test: real processes, and a node of ours that sends, listens and remembers."""
 
 import contextlib
-import ctypes
 import fcntl
 import os
 import signal
@@ -10,6 +9,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -27,12 +27,14 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool, Float64MultiArray, String
 from std_srvs.srv import SetBool, Trigger
 
+from physai.processes import die_with
 from physai.ros import qos
-from physai.ros.commands import TOPIC
+from physai.ros.commands import topic
+from physai.signals import Quantity
 
 SHM = Path("/dev/shm")
-_PR_SET_PDEATHSIG = 1
-_LIBC = ctypes.CDLL(None)
+
+TOPIC = topic(Quantity.JOINT_VELOCITY)
 
 
 def wait_for(condition: Callable[[], Any], timeout: float = 20.0, what: str = "") -> Any:
@@ -56,7 +58,7 @@ class Process:
             stderr=subprocess.STDOUT,
             text=True,
             env={**os.environ, "ROS_DOMAIN_ID": str(domain), "PYTHONUNBUFFERED": "1", **(env or {})},
-            preexec_fn=lambda: _LIBC.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL),
+            preexec_fn=partial(die_with, os.getpid()),
             start_new_session=True,
         )
         self._reader = threading.Thread(target=self._read, daemon=True)

@@ -9,7 +9,7 @@ class RaisingController(Controller):
 
     def update(self, *args, **kwargs):
         command = super().update(*args, **kwargs)
-        self.moved += command.velocity is not None and command.velocity.any()
+        self.moved += command.value is not None and command.value.any()
         if self.moved > 20:
             raise RuntimeError("the controller broke")
         return command

@@ -80,7 +80,7 @@ def test_a_second_env_takes_the_robot_over_and_the_first_says_so(start_robot, ma
 def test_an_episode_over_ros_is_the_episode_in_process(start_robot, make):
     start_robot()
     ours = make()
-    theirs = gymnasium.make("physai/Reacher-v0", overrides=["env.task.start_spread=[0.0,0.0]"])
+    theirs = gymnasium.make("physai/Reacher-v0", overrides=["env.start.spread=[0.0,0.0]"])
     assert ours.observation_space == theirs.observation_space
     assert ours.action_space == theirs.action_space
     first, expected = (env.reset(seed=3)[0] for env in (ours, theirs))
@@ -139,7 +139,7 @@ def test_an_interrupted_evaluation_leaves_a_standing_arm(start, start_robot, pee
 @pytest.mark.slow
 def test_a_policy_reaches_the_same_goals_over_ros_as_in_process(start, start_robot, run):
     start_robot()
-    here = ["env=reacher", "env.task.start_spread=[0.0,0.0]", "randomization=none"]
+    here = ["env=reacher", "env.start.spread=[0.0,0.0]", "randomization=none"]
     for arguments in (["env=ros_reacher"], here):
         command = start.run(evaluate(f"run={run}", "episodes=50", *arguments))
         assert command.wait(280.0) == 0, command.output

@@ -22,7 +22,7 @@ def test_closes_the_loop_until_the_goal_is_reached(policy_path, domain):
         assert said[-2:] == ["active", "reached"]
         position = [float(word) for word in robot.lines[-1].split("[")[1].rstrip("]").split(",")]
         policy = load_policy(policy_path)
-        assert policy.distance(position, goal) < policy.metadata.goal_tolerance
+        assert policy.error(position, goal) < policy.metadata.tolerances[0].value
     finally:
         robot.end()
         node.end()

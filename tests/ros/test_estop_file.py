@@ -90,11 +90,13 @@ def test_a_change_that_half_succeeded_is_made_again(home, monkeypatch):
     file = EmergencyStopFile(NODE, 7)
     file.remember()
     wait_for(lambda: file._synced)
-    sync = estop_file._sync
-    monkeypatch.setattr(estop_file, "_sync", lambda folder: (_ for _ in ()).throw(OSError(5, "Input/output error")))
+    sync = estop_file.sync_folder
+    monkeypatch.setattr(
+        estop_file, "sync_folder", lambda folder: (_ for _ in ()).throw(OSError(5, "Input/output error"))
+    )
     file.forget()
     wait_for(lambda: file.failures)
-    monkeypatch.setattr(estop_file, "_sync", sync)
+    monkeypatch.setattr(estop_file, "sync_folder", sync)
     file.remember()  # the file has gone, and nobody knows whether for good
     closed(file)
     assert file.path.exists()

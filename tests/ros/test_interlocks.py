@@ -133,7 +133,7 @@ def test_it_drives_only_after_enable_unless_told_to_start_by_itself(policy_path)
         loop.peer.moved()
         since = time.monotonic()
         answer = loop.peer.enable(False)
-        assert (answer.success, answer.message) == (True, "disabled: zero velocity")
+        assert (answer.success, answer.message) == (True, "disabled: the arm stands")
         assert loop.peer.first_zeros(after=since) < 0.05
         loop.peer.all_zeros(after=since + 0.05, commands=30)
         since = time.monotonic()

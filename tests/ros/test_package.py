@@ -22,11 +22,10 @@ import yaml
 from hatchling.builders.wheel import WheelBuilder
 
 from physai.ros.command_watchdog import WatchdogConfig
-from physai.ros.commands import TOPIC
 from physai.ros.inference_node import InferenceConfig
 from physai.ros.record import RecordConfig
 from physai.ros.virtual_robot import VirtualRobotConfig
-from tests.ros.peer import wait_for
+from tests.ros.peer import TOPIC, wait_for
 
 REPOSITORY = Path(__file__).parents[2]
 PACKAGE = REPOSITORY / "physai" / "ros" / "package"

@@ -202,4 +202,4 @@ def test_bad_and_fixed_values_are_refused_while_the_arm_moves_and_change_nothing
 
 def test_an_empty_list_of_the_command_line_is_the_empty_list(domain, start):
     node = start("virtual_robot", joints="[]", fault_nan=1)
-    node.says("takes velocities of ['joint1', 'joint2']")
+    node.says("takes joint_velocity of ['joint1', 'joint2']")

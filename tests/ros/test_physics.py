@@ -12,12 +12,11 @@ from rclpy.parameter import Parameter
 from std_msgs.msg import Float64MultiArray
 
 from physai.errors import UserError
-from physai.physics import nominal_dynamics
+from physai.physics import RobotState, nominal_dynamics
 from physai.robots import RobotSpec
 from physai.ros import RosPhysics
-from physai.ros.commands import TOPIC
 from physai.ros.robot_link import RobotError
-from tests.ros.peer import wait_for
+from tests.ros.peer import TOPIC, wait_for
 
 DT = 0.02
 OPTIONS = {"homing_speed": 2.0, "state_timeout": 0.5, "reset_service": "/virtual_robot/reset", "remap": []}
@@ -46,13 +45,17 @@ def connect(spec, domain, monkeypatch):
 
 
 def home(physics):
-    physics.reset(ROW, REST, REST)
+    physics.reset(ROW, RobotState(REST, REST))
+
+
+def arrays(state):
+    return state.joint_position, state.joint_velocity
 
 
 def move(physics, velocity, steps):
     for _ in range(steps):
         state = physics.step(np.array([velocity]))
-    return state
+    return arrays(state)
 
 
 def set_fault(peer, **values):
@@ -108,7 +111,7 @@ def test_the_reset_service_puts_a_virtual_robot_home_at_once(start_robot, connec
     before = time.monotonic()
     home(physics)
     assert time.monotonic() - before < 1.0  # driving 2 rad at 2 rad/s would take longer
-    np.testing.assert_allclose(physics.joint_state()[0], 0.0, atol=0.02)
+    np.testing.assert_allclose(physics.robot_state().joint_position, 0.0, atol=0.02)
 
 
 def test_a_robot_without_the_service_is_driven_home_and_stands_there(start_robot, connect, peer):
@@ -117,7 +120,7 @@ def test_a_robot_without_the_service_is_driven_home_and_stands_there(start_robot
     move(physics, [2.0, -1.0], 40)
     since = time.monotonic()
     home(physics)
-    q, qd = physics.joint_state()
+    q, qd = arrays(physics.robot_state())
     assert np.abs(q).max() <= 0.02
     np.testing.assert_allclose(qd, 0.0, atol=0.01)
     sent = np.array([command for at, command in peer.commands if at > since + 0.1])
@@ -128,9 +131,9 @@ def test_a_robot_without_the_service_is_driven_home_and_stands_there(start_robot
 def test_a_continuous_joint_goes_the_shorter_way_around(start_robot, connect):
     start_robot("-r", "__node:=arm")
     physics = connect()
-    physics.reset(ROW, np.array([[3.0, 0.0]]), REST)
-    physics.reset(ROW, np.array([[-3.0, 0.0]]), REST)
-    assert physics.joint_state()[0][0, 0] == pytest.approx(2 * np.pi - 3.0, abs=0.021)
+    physics.reset(ROW, RobotState(np.array([[3.0, 0.0]]), REST))
+    physics.reset(ROW, RobotState(np.array([[-3.0, 0.0]]), REST))
+    assert physics.robot_state().joint_position[0, 0] == pytest.approx(2 * np.pi - 3.0, abs=0.021)
 
 
 @pytest.mark.slow
@@ -138,7 +141,7 @@ def test_an_arm_that_does_not_get_to_its_start_is_named(start_robot, connect, pe
     start_robot("-r", "__node:=arm", "-r", f"{TOPIC}:=/elsewhere")
     physics = connect()
     with pytest.raises(RobotError, match=r"does not get to its start: 0.500 rad off after \d s"):
-        physics.reset(ROW, np.array([[0.5, 0.0]]), REST)
+        physics.reset(ROW, RobotState(np.array([[0.5, 0.0]]), REST))
     wait_for(lambda: zeros_last(peer))
 
 
@@ -267,9 +270,9 @@ def test_what_a_robot_behind_ros_cannot_do_is_refused_in_one_line(start_robot, c
     start_robot()
     physics = connect()
     with pytest.raises(UserError, match=r"cannot be set; choose randomization=none"):
-        physics.reset(ROW, REST, REST, nominal_dynamics(spec))
+        physics.reset(ROW, RobotState(REST, REST), nominal_dynamics(spec))
     with pytest.raises(UserError, match="starts from rest"):
-        physics.reset(ROW, REST, REST + 1.0)
+        physics.reset(ROW, RobotState(REST, REST + 1.0))
     with pytest.raises(UserError, match="must be finite"):
         physics.step(np.array([[0.5, np.nan]]))
     for question in (physics.state, physics.parameters):

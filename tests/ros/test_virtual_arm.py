@@ -8,39 +8,45 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from physai.errors import UserError
-from physai.ros.virtual_arm import VelocityController, VirtualArm
+from physai.ros.virtual_arm import GroupController, VirtualArm
+from physai.signals import Quantity
+
+
+def make(joints, timeout=0.0):
+    return GroupController(np.zeros(joints), Quantity.JOINT_VELOCITY, timeout)
+
 
 WILD = st.floats() | st.just(math.nan)
 
 
 def test_the_last_velocity_holds_for_ever():
-    controller = VelocityController(2)
-    assert controller.velocity(0.0).tolist() == [0.0, 0.0]
+    controller = make(2)
+    assert controller.value(0.0).tolist() == [0.0, 0.0]
     controller.command([0.1, -0.2], 1.0)
-    assert controller.velocity(1e9).tolist() == [0.1, -0.2]
+    assert controller.value(1e9).tolist() == [0.1, -0.2]
 
 
 def test_with_a_timeout_it_ends_until_the_next_command():
-    controller = VelocityController(1, timeout=0.5)
+    controller = make(1, timeout=0.5)
     controller.command([0.1], 1.0)
-    assert controller.velocity(1.5).tolist() == [0.1]
-    assert controller.velocity(1.51).tolist() == [0.0]
+    assert controller.value(1.5).tolist() == [0.1]
+    assert controller.value(1.51).tolist() == [0.0]
     controller.command([0.2], 2.0)
-    assert controller.velocity(2.1).tolist() == [0.2]
+    assert controller.value(2.1).tolist() == [0.2]
     controller.timeout = 0.0
-    assert controller.velocity(1e9).tolist() == [0.2]
+    assert controller.value(1e9).tolist() == [0.2]
 
 
 def test_a_dropped_command_does_not_prolong_the_last():
-    controller = VelocityController(1, timeout=0.5)
+    controller = make(1, timeout=0.5)
     controller.command([0.1], 1.0)
     controller.command([math.nan], 1.4)
-    assert controller.velocity(1.6).tolist() == [0.0]
+    assert controller.value(1.6).tolist() == [0.0]
 
 
 @given(st.lists(st.lists(WILD, max_size=4), max_size=20))
 def test_it_does_what_the_real_one_does_with_every_sequence_of_commands(commands):
-    controller = VelocityController(2)
+    controller = make(2)
     expected, active = [0.0, 0.0], True
     for now, command in enumerate(commands):
         controller.command(command, float(now))
@@ -48,19 +54,40 @@ def test_it_does_what_the_real_one_does_with_every_sequence_of_commands(commands
             expected, active = [0.0, 0.0], False
         elif active and all(map(math.isfinite, command)):
             expected = command
-        assert controller.velocity(float(now)).tolist() == expected
+        assert controller.value(float(now)).tolist() == expected
         assert controller.active == active
     controller.activate()
-    assert controller.velocity(0.0).tolist() == [0.0, 0.0]
+    assert controller.value(0.0).tolist() == [0.0, 0.0]
     controller.command([1.0, 2.0], 0.0)
-    assert controller.velocity(0.0).tolist() == [1.0, 2.0]
+    assert controller.value(0.0).tolist() == [1.0, 2.0]
+
+
+def test_a_controller_of_positions_stays_where_it_was_sent_to_whatever_happens():
+    controller = GroupController(np.array([0.5, 0.5]), Quantity.JOINT_POSITION, timeout=0.5)
+    assert controller.value(0.0).tolist() == [0.5, 0.5]
+    controller.command([0.1, 0.2], 1.0)
+    assert controller.value(9.0).tolist() == [0.1, 0.2]
+    controller.command([0.1], 9.0)
+    assert not controller.active
+    assert controller.value(9.0).tolist() == [0.1, 0.2]
+
+
+def test_an_arm_that_takes_positions_goes_where_it_is_told_and_starts_at_home():
+    arm = VirtualArm("reacher", "none", 0, 0.01, ["env.robot.command=joint_position"])
+    try:
+        assert arm.rest.tolist() == [0.0, 0.0]
+        for _ in range(100):
+            position, _ = arm.step(np.array([0.3, -0.2]))
+        np.testing.assert_allclose(position, [0.3, -0.2], atol=2e-3)
+    finally:
+        arm.close()
 
 
 def test_a_command_is_copied():
-    controller, command = VelocityController(1), np.array([0.1])
+    controller, command = make(1), np.array([0.1])
     controller.command(command, 0.0)
     command[:] = 5.0
-    assert controller.velocity(0.0).tolist() == [0.1]
+    assert controller.value(0.0).tolist() == [0.1]
 
 
 def path(randomization: str, seed: int) -> np.ndarray:

@@ -93,7 +93,7 @@ def test_a_command_of_a_wrong_length_makes_it_deaf_until_a_reset(robot):
     robot.command(0.2, -0.1)
     robot.settles_at(0.2, -0.1)
     robot.command(0.2)
-    robot.process.says("1 velocities for 2 joints: inactive until ~/reset")
+    robot.process.says("1 numbers for 2 joints: inactive until ~/reset")
     robot.settles_at(0.0, 0.0)
     robot.command(0.3, 0.3)
     robot.state(after=time.monotonic() + 0.2)

@@ -119,8 +119,9 @@ def test_a_goal_inside_is_its_own_nearest_point():
     np.testing.assert_array_equal(BOX.project(np.array([0.1, 0.2, 2.0])), [0.1, 0.2, 2.0])
 
 
-def test_nothing_is_nearest_to_the_centre_of_a_ring():
-    assert RING.project(np.zeros(2)) is None
+@pytest.mark.parametrize("goal", [[0.0, 0.0], [1e-9, 0.0], [1.7e308, 1.7e308]])
+def test_nothing_is_nearest_to_the_centre_of_a_ring_or_to_what_is_too_far_to_have_a_distance(goal):
+    assert RING.project(np.array(goal)) is None
 
 
 def test_a_description_says_where_a_goal_lies_and_where_it_should():

@@ -1,14 +1,21 @@
 """Runs that are small enough to test with."""
 
+import contextlib
 import csv
+import json
 import os
 import subprocess
 import sys
 from pathlib import Path
 from typing import Any
 
+from omegaconf import OmegaConf
+
 from physai.config import compose, validate
+from physai.training.agent import Agent
+from physai.training.callbacks import EvaluationCallback
 from physai.training.config import TrainConfig
+from physai.training.run import load_config, make_trainer, run_training
 
 SMALL = (
     "total_frames=16384",
@@ -19,7 +26,9 @@ SMALL = (
     "collector.num_envs=16",
     "collector.frames_per_batch=1024",
     "algo.minibatch_size=256",
+    "export=[]",  # which takes three times as long as all the rest
 )
+EXPORTED = "export=[torchscript,onnx]"  # as by default
 
 
 def small_config(*overrides: str) -> TrainConfig:
@@ -43,3 +52,33 @@ def metrics(run: Path) -> list[dict[str, str]]:
     """``metrics.csv`` without its time columns."""
     with open(run / "metrics.csv") as file:
         return [{k: v for k, v in row.items() if not k.startswith("time/")} for row in csv.DictReader(file)]
+
+
+def run_here(run: Path, *overrides: str) -> None:
+    """Train in this process, which has imported everything already, in a folder that is not there yet."""
+    (run / ".hydra").mkdir(parents=True)
+    node = compose("train", overrides)
+    (run / ".hydra" / "config.yaml").write_text(OmegaConf.to_yaml(node))
+    run_training(validate(TrainConfig, node), run)
+
+
+def train_here(config: TrainConfig, run: Path, resume: bool = False) -> Agent:
+    """Train, without the evaluation at the end; return the agent, closed."""
+    agent = Agent.build(config)
+    with contextlib.closing(agent):
+        make_trainer(config, run, agent, EvaluationCallback(config), resume).fit()
+    return agent
+
+
+def resume_here(run: Path) -> None:
+    """Go on with a run in this process."""
+    run_training(load_config(run), run, resume=True)
+
+
+def assert_same_run(ours: Path, theirs: Path) -> None:
+    """See that two complete runs are one, to the last bit."""
+    first, second = (json.loads((run / "summary.json").read_text()) for run in (ours, theirs))
+    assert first["frames"] == second["frames"]
+    assert metrics(ours) == metrics(theirs)
+    assert (ours / "episodes.csv").read_bytes() == (theirs / "episodes.csv").read_bytes()
+    assert first["weights_sha256"] == second["weights_sha256"]

@@ -10,7 +10,7 @@ from tests.training.small import small_config
 def trained():
     config = small_config("collector=single")  # of whose robots evaluation could make use
     agent = Agent.build(config)
-    agent.env.normalization.update(torch.randn(100, 8))
+    agent.statistics.update(torch.randn(100, 8))
     env = make_evaluation_env(config, config.randomization, 8, seed=1)
     yield agent, env
     env.close()
@@ -19,7 +19,7 @@ def trained():
 
 def result(successes: int, episodes: int) -> Evaluation:
     success = torch.arange(episodes) < successes
-    return Evaluation(success, torch.full((episodes,), 10), torch.zeros(episodes), torch.zeros(episodes))
+    return Evaluation(success, torch.full((episodes,), 10), torch.zeros(episodes), torch.zeros(episodes), "m")
 
 
 def test_the_interval_is_wilsons():
@@ -31,7 +31,7 @@ def test_the_interval_is_wilsons():
 
 def test_steps_to_goal_count_only_goals_that_were_reached():
     evaluation = Evaluation(
-        torch.tensor([True, False, True]), torch.tensor([10, 200, 30]), torch.zeros(3), torch.zeros(3)
+        torch.tensor([True, False, True]), torch.tensor([10, 200, 30]), torch.zeros(3), torch.zeros(3), "m"
     )
     assert evaluation.summary()["steps_to_goal"] == 20
     assert result(0, 3).summary()["steps_to_goal"] is None
@@ -39,11 +39,11 @@ def test_steps_to_goal_count_only_goals_that_were_reached():
 
 def test_evaluation_moves_neither_statistics_nor_random_numbers_nor_the_training_env(trained):
     agent, env = trained
-    env.normalization.load_state_dict(agent.env.normalization.state_dict())
-    statistics = {key: value.clone() for key, value in env.normalization.state_dict().items()}
+    env.normalizer.load_state_dict(agent.statistics.normalizer.state_dict())
+    statistics = {key: value.clone() for key, value in env.normalizer.state_dict().items()}
     random, state = torch.get_rng_state(), agent.collector.state()
     evaluate(agent.actor, env, 8, seed=5)
-    assert all(torch.equal(value, statistics[key]) for key, value in env.normalization.state_dict().items())
+    assert all(torch.equal(value, statistics[key]) for key, value in env.normalizer.state_dict().items())
     assert torch.equal(random, torch.get_rng_state())
     after = agent.collector.state()
     for part in ("simulation", "transforms"):
@@ -56,7 +56,7 @@ def test_equal_seeds_give_equal_goals_and_results_whatever_happened_before(train
     evaluate(agent.actor, env, 8, seed=6)
     second = evaluate(agent.actor, env, 20, seed=5)
     assert len(first.success) == 20
-    for name in ("success", "length", "distance", "episode_return"):
+    for name in ("success", "length", "error", "episode_return"):
         assert torch.equal(getattr(first, name), getattr(second, name))
 
 
@@ -64,5 +64,5 @@ def test_only_the_first_episode_of_a_robot_counts(trained):
     agent, env = trained
     evaluation = evaluate(agent.actor, env, 8, seed=5)
     assert (evaluation.length[~evaluation.success] == 200).all()
-    assert (evaluation.distance[evaluation.success] < 0.05).all()
-    assert (evaluation.distance[~evaluation.success] >= 0.05).all()
+    assert (evaluation.error[evaluation.success] < 0.05).all()
+    assert (evaluation.error[~evaluation.success] >= 0.05).all()

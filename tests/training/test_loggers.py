@@ -14,7 +14,7 @@ from tests.training.small import small_config
 def log(config, run, frames):
     """A part of a run, from its start or where it is resumed, to its end."""
     logger = make_logger(config, run)
-    written = RunLog(run, lambda: logger)
+    written = RunLog(run, (), lambda: logger)
     written.metrics(frames, 1, {"loss_objective": 0.5 * frames, "evaluation/success_rate": 1.0})
     written.close()
     return logger

@@ -30,15 +30,22 @@ def batch():
     terminated = torch.tensor([[False, False, False], [True, False, False]])[..., None]
     returns = torch.tensor([[-1.0, -2.0, -3.0], [9.0, -1.0, -2.0]])[..., None]
     length = torch.tensor([[198, 199, 200], [40, 1, 2]])[..., None]
-    after = {"done": done, "terminated": terminated, "episode_return": returns, "episode_length": length}
+    rewards = torch.cat([returns - 1.0, torch.ones_like(returns)], dim=-1)
+    after = {"done": done, "success": terminated, "episode_rewards": rewards, "episode_length": length}
     return TensorDict({"next": TensorDict(after, [2, 3])}, [2, 3])
 
 
 def test_an_episode_is_written_with_the_frame_at_which_it_ended(tmp_path):
-    log = RunLog(tmp_path, Scalars)
+    log = RunLog(tmp_path, ("distance", "bonus"), Scalars)
     means = log.episodes(batch(), first_frame=100)
     log.close()
-    assert means == {"episode/return": 3.0, "episode/length": 120.0, "episode/success_rate": 0.5}
+    assert means == {
+        "episode/return": 3.0,
+        "episode/length": 120.0,
+        "episode/success_rate": 0.5,
+        "reward/distance": 2.0,
+        "reward/bonus": 1.0,
+    }
     assert rows(tmp_path / "episodes.csv") == [
         {"frame": "102", "return": "9.0", "length": "40", "success": "1"},
         {"frame": "106", "return": "-3.0", "length": "200", "success": "0"},
@@ -46,13 +53,13 @@ def test_an_episode_is_written_with_the_frame_at_which_it_ended(tmp_path):
 
 
 def test_a_resumed_log_forgets_what_came_after_its_checkpoint(tmp_path):
-    log = RunLog(tmp_path, Scalars)
+    log = RunLog(tmp_path, ("distance", "bonus"), Scalars)
     log.metrics(10, 1, {"loss": 0.5})
     state = log.state()
     log.metrics(20, 2, {"loss": 0.4})
     log.episodes(batch(), first_frame=20)
     log.close()
-    again = RunLog(tmp_path, Scalars, state)
+    again = RunLog(tmp_path, ("distance", "bonus"), Scalars, state)
     again.metrics(20, 2, {"loss": 0.3})
     again.close()
     assert [(row["frames"], row["loss"]) for row in rows(tmp_path / "metrics.csv")] == [
@@ -64,7 +71,7 @@ def test_a_resumed_log_forgets_what_came_after_its_checkpoint(tmp_path):
 
 def test_every_value_reaches_the_logger_at_its_frame(tmp_path):
     scalars = Scalars()
-    log = RunLog(tmp_path, lambda: scalars)
+    log = RunLog(tmp_path, ("distance", "bonus"), lambda: scalars)
     log.metrics(10, 1, {"loss": 0.5, "evaluation/success_rate": 1.0})
     log.close()
     assert scalars.rows == [(10, "loss", 0.5), (10, "evaluation/success_rate", 1.0)]
@@ -72,7 +79,7 @@ def test_every_value_reaches_the_logger_at_its_frame(tmp_path):
 
 def test_a_logger_is_made_once_and_not_before_it_is_needed(tmp_path):
     made = []
-    log = RunLog(tmp_path, lambda: made.append(Scalars()) or made[-1])
+    log = RunLog(tmp_path, ("distance", "bonus"), lambda: made.append(Scalars()) or made[-1])
     log.episodes(batch(), first_frame=0)
     log.state()
     assert not made

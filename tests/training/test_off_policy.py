@@ -9,8 +9,7 @@ import pytest
 import torch
 
 from physai.training.agent import Agent
-from physai.training.loop import train
-from tests.training.small import SMALL, command, metrics, small_config
+from tests.training.small import SMALL, command, metrics, resume_here, small_config, train_here
 
 OFF_POLICY = (
     "algo=sac",
@@ -27,8 +26,7 @@ OFF_POLICY = (
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):
     folder = tmp_path_factory.mktemp("off_policy")
-    agent, _ = train(small_config(*OFF_POLICY), folder, resume=False)
-    agent.close()
+    agent = train_here(small_config(*OFF_POLICY), folder)
     return folder, agent.weights_sha256()
 
 
@@ -54,8 +52,7 @@ def test_it_goes_on_from_any_checkpoint_bit_for_bit(finished, tmp_path, frames):
     assert later
     for path in later:
         path.unlink()
-    agent, _ = train(small_config(*OFF_POLICY), tmp_path / "run", resume=True)
-    agent.close()
+    agent = train_here(small_config(*OFF_POLICY), tmp_path / "run", resume=True)
     assert agent.weights_sha256() == digest
     assert metrics(tmp_path / "run") == metrics(whole)
     assert (tmp_path / "run" / "episodes.csv").read_bytes() == (whole / "episodes.csv").read_bytes()
@@ -69,9 +66,7 @@ def test_killed_and_resumed_it_ends_like_the_uninterrupted_run(finished, tmp_pat
         time.sleep(0.01)
     process.send_signal(signal.SIGKILL)
     assert process.wait() == -signal.SIGKILL
-    process = command("train", "resume=run", cwd=tmp_path)
-    output = process.communicate()[0]
-    assert process.returncode == 0, output
+    resume_here(tmp_path / "run")
     whole, digest = finished
     assert json.loads((tmp_path / "run" / "summary.json").read_text())["weights_sha256"] == digest
     assert metrics(tmp_path / "run") == metrics(whole)

@@ -1,10 +1,7 @@
 """Training with robots in processes of their own: nothing hangs, nothing is left behind, and runs go on."""
 
-import functools
-import json
 import os
 import signal
-import subprocess
 import sys
 import time
 from importlib.util import find_spec
@@ -12,104 +9,91 @@ from importlib.util import find_spec
 import pytest
 
 from tests.training.processes import all_gone, command_of, descendants
-from tests.training.small import SMALL, command, metrics
+from tests.training.small import SMALL, assert_same_run, command, metrics, resume_here, run_here
 
 SIZES = (*SMALL, "collector.num_envs=64", "collector.frames_per_batch=1024", "env.task.max_steps=40")
 needs_ray = pytest.mark.skipif(find_spec("ray") is None, reason="needs ray")
 COLLECTORS = ("async", "multi_sync", "multi_async", pytest.param("ray", marks=needs_ray))
-WORKERS = {"single": 0, "async": 1}  # others have two
+WORKERS = {"async": 1}  # others have two
 pytestmark = [
     pytest.mark.slow,
-    pytest.mark.timeout(900),  # two or three whole runs each
+    pytest.mark.timeout(600),  # four starts each
     pytest.mark.skipif(sys.platform != "linux", reason="workers are found in /proc"),
 ]
 
 
-@pytest.fixture(scope="module")
-def finished(tmp_path_factory):
-    """Makes, once for each collector, a run that nothing has disturbed."""
+class Run:
+    """A run in ``folder / "run"``, which can be started again and again.
 
-    @functools.cache
-    def run(collector):
-        folder = tmp_path_factory.mktemp(collector)
-        process = command("train", *SIZES, f"collector={collector}", "hydra.run.dir=run", cwd=folder)
-        output = process.communicate()[0]
-        assert process.returncode == 0, output
-        return folder / "run"
+    Attributes:
+        process: The command.
+        workers: Processes that step robots.
+        everybody: All of its processes.
+    """
 
-    return lambda collector: run("multi_sync" if collector == "ray" else collector)  # whose runs are the same
+    def __init__(self, folder, collector):
+        self.folder, self.path, self.collector = folder, folder / "run", collector
 
+    def start(self):
+        """Start it or go on with it, and wait until it has learnt from its first batch."""
+        log, begin = self.path / "metrics.csv", [*SIZES, f"collector={self.collector}", "hydra.run.dir=run"]
+        before = log.read_bytes() if log.is_file() else b""
+        saved = max((int(path.stem) for path in self.path.glob("checkpoints/0*.pt")), default=0)
+        arguments = ["resume=run"] if self.path.is_dir() else begin
+        # A process group, as a terminal makes.
+        self.process = command("train", *arguments, cwd=self.folder, start_new_session=True)
+        deadline = time.monotonic() + 120
+        while not self._has_learnt(log, before, saved) and self.process.poll() is None:
+            assert time.monotonic() < deadline
+            time.sleep(0.005)
+        assert self.process.poll() is None, self.process.communicate()[0]
+        self.everybody = descendants(self.process.pid)
+        is_ray = self.collector == "ray"
+        self.workers = {one for one in self.everybody if not is_ray or "WorkerCollector" in command_of(one)}
+        assert len(self.workers) == WORKERS.get(self.collector, 2)
 
-def start(collector, folder, *overrides):
-    """Start a run, wait until it has learnt from its first batch, and return it, its workers and all its processes."""
-    process = subprocess.Popen(
-        [sys.executable, "-m", "physai.train", *SIZES, f"collector={collector}", *overrides, "hydra.run.dir=run"],
-        cwd=folder,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-        start_new_session=True,  # a process group, as a terminal makes
-    )
-    deadline = time.monotonic() + 120
-    while not (folder / "run" / "metrics.csv").is_file() and process.poll() is None and time.monotonic() < deadline:
-        time.sleep(0.005)
-    everybody = descendants(process.pid)
-    workers = {one for one in everybody if collector != "ray" or "WorkerCollector" in command_of(one)}
-    assert len(workers) == WORKERS.get(collector, 2)
-    return process, workers, everybody
+    def _has_learnt(self, log, before, saved):
+        if not log.is_file() or log.read_bytes() == before:
+            return False
+        rows = metrics(self.path)
+        return bool(rows) and int(rows[-1]["frames"] or 0) > saved
 
-
-def assert_goes_on(folder, finished):
-    """Resume a run: it ends as the one that nothing has disturbed, to the last bit."""
-    process = command("train", "resume=run", cwd=folder)
-    output = process.communicate()[0]
-    assert process.returncode == 0, output
-    ours, theirs = (json.loads((run / "summary.json").read_text()) for run in (folder / "run", finished))
-    assert ours["frames"] == theirs["frames"]
-    assert metrics(folder / "run") == metrics(finished)
-    assert ours["weights_sha256"] == theirs["weights_sha256"]
-
-
-@pytest.mark.parametrize("collector", ["single", *COLLECTORS[1:]])  # async: tests/training/test_loop.py
-def test_a_killed_run_leaves_no_process_and_goes_on(finished, tmp_path, collector):
-    process, _, everybody = start(collector, tmp_path)
-    process.kill()
-    process.communicate()
-    assert all_gone(everybody)
-    assert_goes_on(tmp_path, finished(collector))
+    def ends(self, code):
+        """Wait for the end of all of its processes; return what it printed."""
+        output = self.process.communicate(timeout=60)[0]
+        assert self.process.returncode == code, output
+        assert all_gone(self.everybody)
+        return output
 
 
 @pytest.mark.parametrize("collector", COLLECTORS)
-def test_a_killed_worker_ends_the_run_in_one_line_and_it_goes_on(finished, tmp_path, collector):
-    process, workers, everybody = start(collector, tmp_path)
-    os.kill(min(workers), signal.SIGKILL)
+def test_a_run_goes_on_from_a_killed_worker_a_signal_to_all_processes_and_a_kill(once, tmp_path, collector):
+    """Each ends all of its processes; then the run ends as one that nothing has disturbed, to the last bit."""
+    plain = "multi_sync" if collector == "ray" else collector  # whose runs are the same
+    undisturbed = once(f"undisturbed_{plain}", lambda path: run_here(path / "run", *SIZES, f"collector={plain}"))
+    run = Run(tmp_path, collector)
+
+    run.start()
+    os.kill(min(run.workers), signal.SIGKILL)
     killed = time.monotonic()
-    output = process.communicate(timeout=60)[0]
+    output = run.ends(2)
     assert time.monotonic() - killed < 30
-    assert process.returncode == 2, output
     assert "Traceback" not in output
     assert output.count("error: a process that collects has ended (") == 1
-    assert all_gone(everybody)
-    assert_goes_on(tmp_path, finished(collector))
 
+    run.start()
+    number = signal.SIGTERM if collector == "ray" else signal.SIGINT
+    os.killpg(run.process.pid, number)
+    assert "python -m physai.train resume=run" in run.ends(128 + number)
+    checkpoints = sorted((run.path / "checkpoints").glob("0*.pt"))
+    assert int(checkpoints[-1].stem) == int(metrics(run.path)[-1]["frames"])
 
-@pytest.mark.parametrize(
-    ("collector", "number", "code"),
-    [
-        ("async", signal.SIGINT, 130),
-        ("multi_sync", signal.SIGINT, 130),
-        ("multi_async", signal.SIGINT, 130),
-        pytest.param("ray", signal.SIGTERM, 143, marks=needs_ray),
-    ],
-)
-def test_a_signal_that_reaches_all_processes_saves_and_the_run_goes_on(finished, tmp_path, collector, number, code):
-    process, _, everybody = start(collector, tmp_path, "checkpoint.every_frames=1000000")
-    os.killpg(process.pid, number)
-    output = process.communicate()[0]
-    assert process.returncode == code, output
-    assert "python -m physai.train resume=run" in output
-    assert all_gone(everybody)
-    assert_goes_on(tmp_path, finished(collector))
+    run.start()
+    run.process.kill()
+    run.ends(-signal.SIGKILL)
+
+    resume_here(run.path)
+    assert_same_run(run.path, undisturbed / "run")
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,5 @@
 """Training a policy that remembers: its own ratio is one, and it goes on from any moment bit for bit."""
 
-import json
 import signal
 import time
 
@@ -8,8 +7,16 @@ import pytest
 import torch
 
 from physai.training.agent import Agent
-from physai.training.loop import train
-from tests.training.small import SMALL, command, metrics, small_config
+from tests.training.small import (
+    SMALL,
+    assert_same_run,
+    command,
+    metrics,
+    resume_here,
+    run_here,
+    small_config,
+    train_here,
+)
 
 RECURRENT = ("policy=gru", *SMALL, "collector.num_envs=64", "total_frames=8192")  # sequences of 16 steps
 
@@ -50,26 +57,19 @@ def test_one_seed_gives_one_run(tmp_path):
     hashes = []
     for name in ("one", "two"):
         (tmp_path / name).mkdir()
-        agent, _ = train(small_config(*RECURRENT, "total_frames=4096"), tmp_path / name, resume=False)
-        agent.close()
+        agent = train_here(small_config(*RECURRENT, "total_frames=4096"), tmp_path / name)
         hashes.append(agent.weights_sha256())
     assert hashes[0] == hashes[1]
 
 
 @pytest.mark.slow
 def test_killed_and_resumed_it_ends_like_the_uninterrupted_run(tmp_path):
-    for name, kill in (("whole", False), ("killed", True)):
-        process = command("train", *RECURRENT, f"hydra.run.dir={name}", cwd=tmp_path)
-        if kill:
-            while not (tmp_path / name / "metrics.csv").is_file() or len(metrics(tmp_path / name)) < 5:
-                assert process.poll() is None
-                time.sleep(0.01)
-            process.send_signal(signal.SIGKILL)
-            assert process.wait() == -signal.SIGKILL
-            process = command("train", f"resume={name}", cwd=tmp_path)
-        output = process.communicate()[0]
-        assert process.returncode == 0, output
-    whole, killed = (json.loads((tmp_path / name / "summary.json").read_text()) for name in ("whole", "killed"))
-    assert killed["weights_sha256"] == whole["weights_sha256"]
-    assert metrics(tmp_path / "killed") == metrics(tmp_path / "whole")
-    assert (tmp_path / "killed" / "episodes.csv").read_bytes() == (tmp_path / "whole" / "episodes.csv").read_bytes()
+    run_here(tmp_path / "whole", *RECURRENT)
+    process = command("train", *RECURRENT, "hydra.run.dir=killed", cwd=tmp_path)
+    while not (tmp_path / "killed" / "metrics.csv").is_file() or len(metrics(tmp_path / "killed")) < 5:
+        assert process.poll() is None
+        time.sleep(0.01)
+    process.send_signal(signal.SIGKILL)
+    assert process.wait() == -signal.SIGKILL
+    resume_here(tmp_path / "killed")
+    assert_same_run(tmp_path / "killed", tmp_path / "whole")

@@ -4,7 +4,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from physai.transforms import ObservationNormalization
+from physai.transforms import Normalizer, RunningStatistics
 
 OFFSET = np.array([0.0, -5.0, 3.0, 40.0])
 SPREAD = np.array([1.0, 0.1, 7.0, 0.5])
@@ -15,8 +15,8 @@ def batches(shapes, seed=0):
     return [torch.from_numpy(random.normal(OFFSET, SPREAD, (*shape, 4)).astype(np.float32)) for shape in shapes]
 
 
-def normalization(eps=1e-3, clip=10.0):
-    return ObservationNormalization(4, eps, clip)
+def statistics(eps=1e-3, clip=10.0):
+    return RunningStatistics(Normalizer(4, clip), eps)
 
 
 def all_rows(observations):
@@ -24,7 +24,7 @@ def all_rows(observations):
 
 
 def test_statistics_equal_numpy_s_over_uneven_batches_of_any_shape():
-    transform = normalization()
+    transform = statistics()
     seen = batches([(1,), (7,), (128, 32), (3, 5), (2, 2, 2), (1000,)])
     for count, batch in enumerate(seen, 1):
         transform.update(batch)
@@ -41,7 +41,7 @@ def test_statistics_equal_numpy_s_over_uneven_batches_of_any_shape():
 @settings(max_examples=30, deadline=None)
 @given(sizes=st.lists(st.integers(1, 40), min_size=1, max_size=8), seed=st.integers(0, 1000))
 def test_how_observations_are_cut_into_batches_does_not_matter(sizes, seed):
-    transform, whole = normalization(), normalization()
+    transform, whole = statistics(), statistics()
     seen = batches([(size,) for size in sizes], seed)
     for batch in seen:
         transform.update(batch)
@@ -51,7 +51,7 @@ def test_how_observations_are_cut_into_batches_does_not_matter(sizes, seed):
 
 
 def test_normalized_is_the_clipped_distance_from_the_mean_in_standard_deviations():
-    transform = normalization(clip=2.0)
+    transform = statistics(clip=2.0)
     (seen,) = batches([(500,)])
     transform.update(seen)
     rows = all_rows([seen])
@@ -63,21 +63,21 @@ def test_normalized_is_the_clipped_distance_from_the_mean_in_standard_deviations
 
 
 def test_normalizing_changes_no_statistics_and_none_means_no_change():
-    transform = normalization()
+    transform = statistics()
     (seen,) = batches([(50,)])
     assert torch.equal(transform.normalizer(seen), seen.clamp(-10, 10))
     assert transform.count == 0
 
 
 def test_what_never_varies_is_divided_by_eps():
-    transform = normalization(eps=0.01)
+    transform = statistics(eps=0.01)
     transform.update(torch.full((30, 4), 2.5))
     assert transform.normalizer.scale.tolist() == pytest.approx([0.01] * 4)
     torch.testing.assert_close(transform.normalizer(torch.full((4,), 2.51)), torch.ones(4), rtol=1e-3, atol=0)
 
 
 def test_state_dict_carries_the_statistics():
-    transform, restored = normalization(), normalization()
+    transform, restored = statistics(), statistics()
     seen = batches([(20,), (30,)])
     transform.update(seen[0])
     restored.load_state_dict(transform.state_dict())

@@ -10,30 +10,28 @@ import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from physai.errors import UserError
-from physai.training import loop
+from physai.training import callbacks
 from physai.training.agent import Agent
 from physai.training.checkpoint import load
-from physai.training.loop import train
-from physai.training.run import run_training
-from tests.training.small import SMALL, command, metrics, small_config
-
-
-@pytest.fixture(scope="module")
-def finished(tmp_path_factory):
-    """A run, in a folder as the command leaves it."""
-    folder = tmp_path_factory.mktemp("finished")
-    process = command("train", *SMALL, "hydra.run.dir=run", cwd=folder)
-    output = process.communicate()[0]
-    assert process.returncode == 0, output
-    return folder / "run", output
+from physai.training.run import make_trainer, run_training
+from tests.training.small import (
+    SMALL,
+    assert_same_run,
+    command,
+    metrics,
+    resume_here,
+    run_here,
+    small_config,
+    train_here,
+)
 
 
 def digest(run):
     return json.loads((run / "summary.json").read_text())["weights_sha256"]
 
 
-def test_a_run_folder_tells_its_whole_story(finished):
-    run, output = finished
+def test_a_run_folder_tells_its_whole_story(small_run):
+    run, output = small_run, (small_run.parent / "output.txt").read_text()
     summary = json.loads((run / "summary.json").read_text())
     assert {
         "success_rate",
@@ -58,6 +56,8 @@ def test_a_run_folder_tells_its_whole_story(finished):
     events = EventAccumulator(str(run / "tensorboard")).Reload()
     assert {
         "episode/return",
+        "reward/distance",
+        "reward/success",
         "loss_objective",
         "kl_approx",
         "lr",
@@ -66,13 +66,12 @@ def test_a_run_folder_tells_its_whole_story(finished):
     } <= set(events.Tags()["scalars"])
 
 
-def test_one_seed_gives_one_run_and_another_seed_another(finished, tmp_path):
-    run, _ = finished
+def test_one_seed_gives_one_run_and_another_seed_another(small_run, tmp_path):
+    run = small_run
     same, other = tmp_path / "same", tmp_path / "other"
     for path, seed in ((same, 0), (other, 1)):
         path.mkdir()
-        agent, _ = train(small_config(f"seed={seed}"), path, resume=False)
-        agent.close()
+        agent = train_here(small_config(f"seed={seed}"), path)
         if path is same:
             assert agent.weights_sha256() == digest(run)
         else:
@@ -89,11 +88,17 @@ def wait_until(condition, process, seconds=60):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("moment", [0.0, 0.4, "writing"])
-def test_a_run_killed_at_any_moment_and_resumed_ends_like_the_uninterrupted_one(finished, tmp_path, moment):
-    run, _ = finished
+@pytest.mark.parametrize(
+    ("collector", "moment"), [("async", 0.0), ("async", 0.4), ("async", "writing"), ("single", 0.1)]
+)
+def test_a_run_killed_at_any_moment_and_resumed_ends_like_the_uninterrupted_one(
+    small_run, once, tmp_path, collector, moment
+):
+    whole = small_run
+    if collector == "single":
+        whole = once("small_run_single", lambda path: run_here(path / "run", *SMALL, "collector=single")) / "run"
     checkpoints = tmp_path / "run" / "checkpoints"
-    process = command("train", *SMALL, "hydra.run.dir=run", cwd=tmp_path)
+    process = command("train", *SMALL, f"collector={collector}", "hydra.run.dir=run", cwd=tmp_path)
     if moment == "writing":
         wait_until(lambda: checkpoints.is_dir() and len(list(checkpoints.glob("0*.pt"))) >= 2, process)
         wait_until(lambda: any(checkpoints.glob(".*.tmp")), process)
@@ -102,17 +107,13 @@ def test_a_run_killed_at_any_moment_and_resumed_ends_like_the_uninterrupted_one(
         time.sleep(moment)
     process.kill()
     assert process.wait() == -signal.SIGKILL
-    resumed = command("train", "resume=run", cwd=tmp_path)
-    output = resumed.communicate()[0]
-    assert resumed.returncode == 0, output
-    assert digest(tmp_path / "run") == digest(run)
-    assert metrics(tmp_path / "run") == metrics(run)
-    assert (tmp_path / "run" / "episodes.csv").read_bytes() == (run / "episodes.csv").read_bytes()
+    resume_here(tmp_path / "run")
+    assert_same_run(tmp_path / "run", whole)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-def test_a_stopped_run_saves_says_how_to_go_on_and_goes_on(finished, tmp_path, number, code):
+def test_a_stopped_run_saves_says_how_to_go_on_and_goes_on(small_run, tmp_path, number, code):
     process = command("train", *SMALL, "checkpoint.every_frames=1000000", "hydra.run.dir=run", cwd=tmp_path)
     wait_until((tmp_path / "run" / "metrics.csv").is_file, process)
     os.kill(process.pid, number)
@@ -123,32 +124,47 @@ def test_a_stopped_run_saves_says_how_to_go_on_and_goes_on(finished, tmp_path, n
     resumed = command("train", "resume=run", cwd=tmp_path)
     output = resumed.communicate()[0]
     assert resumed.returncode == 0, output
-    assert digest(tmp_path / "run") == digest(finished[0])
+    assert_same_run(tmp_path / "run", small_run)
 
 
-def test_robots_that_judge_are_built_when_first_needed_and_that_moves_no_random_number():
-    agent = Agent.build(small_config())
-    judge = loop._Judge(small_config())
-    assert judge._env is None
-    before = torch.get_rng_state()
-    first, again = judge(agent), judge(agent)
+@pytest.fixture
+def evaluating(tmp_path):
+    """Make a trainer that is due for an evaluation, and what evaluates."""
+    made = []
+
+    def make(*overrides):
+        config = small_config(*overrides)
+        agent, evaluation = Agent.build(config), callbacks.EvaluationCallback(config)
+        made.extend([agent, evaluation])
+        trainer = make_trainer(config, tmp_path, agent, evaluation)
+        trainer.clock.frames = config.total_frames
+        return trainer, evaluation
+
+    yield make
+    for one in made:
+        one.close()
+
+
+def test_robots_for_evaluation_are_made_when_first_needed_and_that_moves_no_random_number(evaluating):
+    trainer, evaluation = evaluating()
+    assert evaluation._env is None
+    batch, before, values = torch.zeros(16, 64), torch.get_rng_state(), [{}, {}]
+    for one in values:
+        evaluation.after_batch(trainer, batch, one)
     assert torch.equal(torch.get_rng_state(), before)
-    assert torch.equal(first.episode_return, again.episode_return)
-    judge.close()
-    agent.close()
+    assert values[0] == values[1]
+    assert {"evaluation/success_rate", "evaluation/return", "evaluation/final_distance"} <= set(values[0])
 
 
-def test_more_goals_than_robots_are_judged_in_rounds(monkeypatch):
-    monkeypatch.setattr(loop, "MAX_ROBOTS", 8)
-    agent, judge = Agent.build(small_config()), loop._Judge(small_config("evaluation.goals=20"))
-    assert len(judge(agent).success) == 20
-    assert judge._env.simulation.num_envs == 8
-    judge.close()
-    agent.close()
+def test_more_goals_than_robots_are_evaluated_in_rounds(evaluating, monkeypatch):
+    monkeypatch.setattr(callbacks, "MAX_ROBOTS", 8)
+    trainer, evaluation = evaluating("evaluation.goals=20")
+    assert len(evaluation._evaluate(trainer).success) == 20
+    assert evaluation._env.simulation.num_envs == 8
 
 
-def test_resuming_a_complete_run_shows_its_result(finished, capsys):
-    run, _ = finished
+def test_resuming_a_complete_run_shows_its_result(small_run, capsys):
+    run = small_run
     before = digest(run)
     run_training(small_config(), run, resume=True)
     assert "complete already" in capsys.readouterr().out
@@ -158,7 +174,7 @@ def test_resuming_a_complete_run_shows_its_result(finished, capsys):
 def test_a_loss_that_explodes_stops_the_run_and_keeps_the_evidence(tmp_path):
     config = small_config("algo.optimizer.lr=1e30", "algo.scheduler=null")
     with pytest.raises(UserError, match=r"iteration \d+: .* is not finite") as stopped:
-        train(config, tmp_path, resume=False)
+        train_here(config, tmp_path)
     evidence = load(tmp_path / "not_finite.pt")
     assert "observation" in str(evidence["batch"].keys())
     kept = sorted((tmp_path / "checkpoints").glob("0*.pt"))[-1]
@@ -181,11 +197,11 @@ def test_a_simulation_that_is_not_finite_stops_the_run(tmp_path, monkeypatch):
             self.physics.set_state(
                 self.physics.state() | {"joint_velocity": self.physics.state()["joint_velocity"] * float("nan")}
             )
-            self._read(*self.physics.joint_state())
+            self.state = self.physics.robot_state()
 
     monkeypatch.setattr(Simulation, "reset", poisoned)
     with pytest.raises(UserError, match=r"iteration \d+: .*from the simulation is not finite"):
-        train(small_config(), tmp_path, resume=False)
+        train_here(small_config(), tmp_path)
     assert (tmp_path / "not_finite.pt").is_file()
 
 
@@ -193,16 +209,16 @@ FULL_DISK = """
 import resource
 from pathlib import Path
 from physai.errors import UserError
-from physai.training import loop
-from tests.training.small import small_config
-save = loop._save
-def limited(agent, clock, log, folder):
-    if clock.frames >= 4096:
+from physai.training.trainer import Trainer
+from tests.training.small import small_config, train_here
+save = Trainer.save
+def limited(self):
+    if self.clock.frames >= 4096:
         resource.setrlimit(resource.RLIMIT_FSIZE, (9_000, resource.getrlimit(resource.RLIMIT_FSIZE)[1]))
-    save(agent, clock, log, folder)
-loop._save = limited
+    save(self)
+Trainer.save = limited
 try:
-    loop.train(small_config(), Path("run"), resume=False)
+    train_here(small_config(), Path("run"))
 except UserError as error:
     print("user error:", error)
 """

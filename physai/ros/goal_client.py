@@ -7,7 +7,6 @@ from types import TracebackType
 
 import numpy as np
 import rclpy
-from geometry_msgs.msg import PointStamped
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.signals import SignalHandlerOptions
@@ -16,10 +15,11 @@ from std_msgs.msg import String
 
 from physai.deploy import Policy, State
 from physai.errors import UserError
-from physai.ros import qos
-from physai.ros.commands import TOPIC
+from physai.ros import goals, qos
+from physai.ros.commands import topic
 from physai.ros.processes import NodeProcess
 from physai.ros.run import prepare_middleware
+from physai.signals import Tolerance
 
 _LOOK = 1.0  # s for others to be discovered
 _START = 30.0  # s until both nodes work
@@ -28,67 +28,75 @@ _SETTLE = 0.1  # s that a goal may take to the node
 
 
 @dataclass
-class Visit:
+class GoalResult:
     """One goal.
 
     Attributes:
-        goal: x and y, m.
-        tolerance: Distance that counts as reached, m.
+        goal: Its numbers, in the order of the policy's goal signal.
+        unit: Of these numbers.
+        tolerances: Errors that count as reached, one for each error of the policy.
         sent: When it was sent, s.
         reached: When it was reached, s; None if it never was.
-        farthest: Largest distance of the tip from the goal while it was held, m.
+        error: Largest errors while it was held.
     """
 
     goal: np.ndarray
-    tolerance: float
+    unit: str
+    tolerances: tuple[Tolerance, ...]
     sent: float
     reached: float | None = None
-    farthest: float = np.inf
+    error: np.ndarray | None = None
+
+    def within(self, error: np.ndarray | None) -> bool:
+        """Whether errors are all within the tolerances."""
+        limits = [tolerance.value for tolerance in self.tolerances]
+        return error is not None and bool((error < limits).all())
 
     @property
     def kept(self) -> bool:
-        """Whether it was reached, and the tip stayed within the tolerance."""
-        return self.reached is not None and self.farthest < self.tolerance
+        """Whether it was reached, and the robot stayed within the tolerances."""
+        return self.reached is not None and self.within(self.error)
 
     def describe(self) -> str:
         """One line."""
-        where = f"({self.goal[0]:+.2f}, {self.goal[1]:+.2f}) m"
-        if self.reached is None:
+        where = f"({', '.join(f'{number:+.2f}' for number in self.goal)}) {self.unit}"
+        if self.reached is None or self.error is None:
             return f"{where}  not reached"
+        worst = int(np.argmax(self.error / [tolerance.value for tolerance in self.tolerances]))
         return (
-            f"{where}  reached in {self.reached - self.sent:4.1f} s, "
-            f"{'held' if self.kept else 'LEFT'}, at most {self.farthest * 100:.1f} cm away"
+            f"{where}  reached in {self.reached - self.sent:4.1f} s, {'held' if self.kept else 'LEFT'}, "
+            f"{self.tolerances[worst].name} at most {self.error[worst]:.3f} {self.tolerances[worst].unit}"
         )
 
 
 @dataclass
-class Tour:
+class Record:
     """What happened.
 
     Attributes:
-        visits: Goals in order.
+        results: Goals in order.
         times: Of the joint states, s.
         positions: Joint positions [n], rad.
     """
 
-    visits: list[Visit] = field(default_factory=list)
+    results: list[GoalResult] = field(default_factory=list)
     times: list[float] = field(default_factory=list)
     positions: list[np.ndarray] = field(default_factory=list)
 
 
-class Tourist:
+class GoalClient:
     """The node that sends goals and watches joint states and the inference node's state, in a context of its own.
 
     Args:
-        policy: Tells how far the tip is from a goal.
+        policy: Tells how far the robot is from a goal.
 
     Attributes:
-        tour: What happened so far.
+        record: What happened so far.
         watch: Processes that must not end meanwhile.
     """
 
     def __init__(self, policy: Policy) -> None:
-        self.tour = Tour()
+        self.record = Record()
         self.watch: Sequence[NodeProcess] = ()
         self._policy = policy
         self._metadata = policy.metadata
@@ -96,10 +104,10 @@ class Tourist:
         prepare_middleware()
         self._context = Context()
         rclpy.init(context=self._context, signal_handler_options=SignalHandlerOptions.NO)
-        self._node = rclpy.create_node("tourist", context=self._context)
+        self._node = rclpy.create_node("goal_client", context=self._context)
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self._node)
-        self._goals = self._node.create_publisher(PointStamped, "/inference_node/goal", 1)
+        self._goals = self._node.create_publisher(goals.goal_type(policy.metadata.goal), "/inference_node/goal", 1)
         self._node.create_subscription(JointState, "/joint_states", self._take_joint_state, qos.SENSOR)
         self._node.create_subscription(String, "/inference_node/state", self._take_state, qos.LATCHED)
 
@@ -112,12 +120,13 @@ class Tourist:
         end = time.monotonic() + _LOOK
         while time.monotonic() < end:
             self._executor.spin_once(0.05)
-            for topic, others in (
-                (TOPIC, self._node.count_subscribers(TOPIC) + self._node.count_publishers(TOPIC)),
+            commands = topic(self._metadata.command.quantity)
+            for name, others in (
+                (commands, self._node.count_subscribers(commands) + self._node.count_publishers(commands)),
                 ("/joint_states", self._node.count_publishers("/joint_states")),
             ):
                 if others:
-                    raise UserError(f"another node uses {topic} here: choose another ROS_DOMAIN_ID")
+                    raise UserError(f"another node uses {name} here: choose another ROS_DOMAIN_ID")
 
     def wait_until_ready(self) -> None:
         """Wait for joint states, and for a node that waits for a goal.
@@ -127,31 +136,28 @@ class Tourist:
         """
         ready = (State.WAITING.value, State.REACHED.value)
         self._spin(
-            lambda: bool(self.tour.times) and self._state in ready and self._goals.get_subscription_count(), _START
+            lambda: bool(self.record.times) and self._state in ready and self._goals.get_subscription_count(), _START
         )
-        if not self.tour.times or self._state not in ready:
-            raise UserError(f"the nodes do not work: joint states: {bool(self.tour.times)}, state: '{self._state}'")
+        if not self.record.times or self._state not in ready:
+            raise UserError(f"the nodes do not work: joint states: {bool(self.record.times)}, state: '{self._state}'")
 
-    def visit(self, goal: np.ndarray, hold: float) -> Visit:
-        """Send a goal [2], m, wait until it is reached, and watch the tip for a while, s."""
-        visit = Visit(goal, self._metadata.goal_tolerance, time.monotonic())
-        self.tour.visits.append(visit)
-        message = PointStamped()
-        message.header.frame_id = self._metadata.goal_frame
-        message.header.stamp = self._node.get_clock().now().to_msg()
-        message.point.x, message.point.y = goal.tolist()
-        self._goals.publish(message)
+    def send(self, goal: np.ndarray, hold: float) -> GoalResult:
+        """Send a goal [g], wait until it is reached, and watch the robot for a while, s."""
+        signal = self._metadata.goal
+        result = GoalResult(goal, signal.unit, self._metadata.tolerances, time.monotonic())
+        self.record.results.append(result)
+        self._goals.publish(goals.to_message(goal.tolist(), signal, self._node.get_clock().now().to_msg()))
         self._spin(lambda: False, _SETTLE)
-        if self._spin(lambda: self._state == State.REACHED.value and self._distance(goal) < visit.tolerance, _PER_GOAL):
-            visit.reached = time.monotonic()
-            seen = len(self.tour.positions)
+        if self._spin(lambda: self._state == State.REACHED.value and result.within(self._error(-1, goal)), _PER_GOAL):
+            result.reached = time.monotonic()
+            seen = len(self.record.positions)
             self._spin(lambda: False, hold)
-            held = self.tour.positions[seen:]
-            visit.farthest = max((self._policy.distance(q, goal) for q in held), default=np.inf)
-        return visit
+            held = range(seen, len(self.record.positions))
+            result.error = np.max([self._error(index, goal) for index in held], axis=0) if held else None
+        return result
 
-    def _distance(self, goal: np.ndarray) -> float:
-        return self._policy.distance(self.tour.positions[-1], goal)
+    def _error(self, index: int, goal: np.ndarray) -> np.ndarray:
+        return self._policy.error(self.record.positions[index], goal)
 
     def _spin(self, done: Callable[[], object], seconds: float) -> bool:
         end = time.monotonic() + seconds
@@ -166,13 +172,13 @@ class Tourist:
 
     def _take_joint_state(self, message: JointState) -> None:
         index = [message.name.index(joint) for joint in self._metadata.joints]
-        self.tour.times.append(time.monotonic())
-        self.tour.positions.append(np.array(message.position)[index])
+        self.record.times.append(time.monotonic())
+        self.record.positions.append(np.array(message.position)[index])
 
     def _take_state(self, message: String) -> None:
         self._state = message.data
 
-    def __enter__(self) -> "Tourist":
+    def __enter__(self) -> "GoalClient":
         return self
 
     def __exit__(self, kind: type | None, error: BaseException | None, trace: TracebackType | None) -> None:

@@ -1,0 +1,51 @@
+"""Goals as ROS messages: which type a goal signal travels in, and how it gets in and out of it."""
+
+from collections.abc import Sequence
+from typing import Any
+
+from builtin_interfaces.msg import Time
+from geometry_msgs.msg import PointStamped
+from sensor_msgs.msg import JointState
+
+from physai.deploy import Goal
+from physai.errors import UserError
+from physai.signals import Quantity, Signal
+
+_TYPES = {Quantity.POSITION: PointStamped, Quantity.JOINT_POSITION: JointState}
+
+
+def goal_type(signal: Signal) -> Any:
+    """Return the message type of a goal signal: PointStamped or JointState.
+
+    Raises:
+        UserError: If there is none for its quantity.
+    """
+    if signal.quantity not in _TYPES:
+        raise UserError(f"the policy's goal is a {signal.quantity.value}: no ROS message of this node carries it")
+    return _TYPES[signal.quantity]
+
+
+def from_message(message: Any, signal: Signal) -> Goal:
+    """Take a goal out of a message of ``goal_type``."""
+    if signal.quantity is Quantity.JOINT_POSITION:
+        return Goal(message.position.tolist(), names=tuple(message.name))
+    return Goal([getattr(message.point, axis) for axis in signal.labels], message.header.frame_id)
+
+
+def to_message(value: Sequence[float], signal: Signal, stamp: Time) -> Any:
+    """Put a goal, numbers in the signal's order, into a message of ``goal_type``."""
+    message = goal_type(signal)()
+    message.header.stamp = stamp
+    if signal.quantity is Quantity.JOINT_POSITION:
+        message.name, message.position = list(signal.labels), [float(number) for number in value]
+    else:
+        message.header.frame_id = signal.frame
+        for axis, number in zip(signal.labels, value, strict=True):
+            setattr(message.point, axis, float(number))
+    return message
+
+
+def describe(goal: Goal, signal: Signal) -> str:
+    """Say what a goal is, for the log."""
+    numbers = ", ".join(f"{number:g}" for number in goal.value)
+    return f"({numbers}) {signal.unit}" + (f", in '{goal.frame}'" if goal.frame else "")

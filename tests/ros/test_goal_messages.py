@@ -1,0 +1,36 @@
+"""Goals in messages: places and joint configurations go in and come out as the policy's signal says."""
+
+import pytest
+from builtin_interfaces.msg import Time
+from geometry_msgs.msg import PointStamped
+from sensor_msgs.msg import JointState
+
+from physai.errors import UserError
+from physai.ros import goals
+from physai.signals import Quantity, Signal
+
+PLACE = Signal("goal", Quantity.POSITION, (3,), labels=("x", "y", "z"), frame="base")
+PLANE = Signal("goal", Quantity.POSITION, (2,), labels=("x", "y"), frame="base")
+JOINTS = Signal("goal", Quantity.JOINT_POSITION, (2,), labels=("a", "b"))
+
+
+@pytest.mark.parametrize("signal", [PLACE, PLANE, JOINTS], ids=["in space", "in the plane", "of joints"])
+def test_a_goal_comes_out_of_its_message_as_it_went_in(signal):
+    value = [0.1, -0.2, 0.3][: signal.size]
+    message = goals.to_message(value, signal, Time(sec=7))
+    assert message.header.stamp.sec == 7
+    goal = goals.from_message(message, signal)
+    assert list(goal.value) == value
+    assert (goal.frame, goal.names) == (signal.frame, () if signal is not JOINTS else ("a", "b"))
+
+
+def test_the_type_of_a_message_follows_from_the_quantity():
+    assert goals.goal_type(PLACE) is goals.goal_type(PLANE) is PointStamped
+    assert goals.goal_type(JOINTS) is JointState
+    with pytest.raises(UserError, match="the policy's goal is a joint_velocity: no ROS message"):
+        goals.goal_type(Signal("goal", Quantity.JOINT_VELOCITY, (2,)))
+
+
+def test_a_goal_is_described_with_unit_and_frame():
+    assert goals.describe(goals.Goal([0.1, 0.4], "base"), PLANE) == "(0.1, 0.4) m, in 'base'"
+    assert goals.describe(goals.Goal([1.0, 2.0]), JOINTS) == "(1, 2) rad"
