@@ -113,22 +113,25 @@ def wandering(spec, robots, random):
     return np.repeat(drawn, 10, axis=0)
 
 
-def test_a_velocity_gain_means_the_same_at_any_number_of_substeps(any_env, spec, make):
-    # Measured, RMS over 4 s: 1.7 mrad on the KUKA, and 9.3 on the planar arm, as much as without any gain to make up
-    # for (8.9): an effort limit that ends within a control period makes that difference.
+def test_a_velocity_gain_means_the_same_at_any_number_of_substeps(spec, make):
+    # An effort limit that ends within a control period makes a difference by itself, which is not the gain's. Measured
+    # with and without gains, RMS over 4 s: 1.7 and 1.1 mrad on the KUKA, 9.3 and 8.9 on the planar arm.
     random = np.random.default_rng(0)
-    parameters = dynamics(spec, 32)
-    parameters["velocity_gain"] = random.uniform(0.3, 1.0, parameters["velocity_gain"].shape)
+    full = dynamics(spec, 32)
+    gains = {**full, "velocity_gain": random.uniform(0.3, 1.0, full["velocity_gain"].shape)}
     begin, given = start(spec, 32, random), wandering(spec, 32, random)
-    found = []
-    for substeps in (1, 2, 20):
-        physics = make(spec, 32, substeps=substeps)
-        reset_all(physics, begin, parameters)
-        found.append(run(physics, given)[:, 0])
-    rms = [np.sqrt(np.mean((other - found[0]) ** 2)) for other in found[1:]]
-    assert max(rms) < (0.012 if any_env.name == "reacher" else 0.003)
-    for key in ("velocity_gain", "effort_limit"):
-        np.testing.assert_array_equal(physics.parameters()[key], parameters[key])
+
+    def difference(parameters, substeps):
+        found = []
+        for number in (1, substeps):
+            physics = make(spec, 32, substeps=number)
+            reset_all(physics, begin, parameters)
+            found.append(run(physics, given)[:, 0])
+        np.testing.assert_array_equal(physics.parameters()["velocity_gain"], parameters["velocity_gain"])
+        return np.sqrt(np.mean((found[1] - found[0]) ** 2))
+
+    for substeps in (2, 20):
+        assert difference(gains, substeps) < difference(full, substeps) + 0.003
 
 
 @pytest.mark.parametrize("substeps", [1, 20])
