@@ -17,7 +17,7 @@ from physai.tasks import Step, Task
 
 _TASK = ("goal", "region", "tolerances", "module", "max_steps", "success", "terminated", "rewards")
 _PHYSICS = ("reset", "step", "robot_state", "close")
-_STATE = ("goal", "last_command", "episode_length", "episode_rewards", "physics_parameters", "within")
+_STATE = ("goal", "last_command", "episode_length", "episode_rewards", "physics_parameters", "within", "success")
 
 
 def _says_whether_simulated(node: dict[str, Any]) -> dict[str, Any]:
@@ -128,11 +128,11 @@ class Simulation:
 
     def reset(self, rows: np.ndarray | None = None, parameters: np.ndarray | None = None) -> None:
         """Start new episodes in the rows of a mask [N] (all by default), with new parameters [N, P] if given."""
-        self._begin(np.arange(self.num_envs) if rows is None else rows.nonzero()[0], parameters)
+        self._begin(np.arange(self.num_envs) if rows is None else rows.nonzero()[0], self.state, parameters)
         self.error = self.task.error(self.state, self.goal)
 
-    def _begin(self, rows: np.ndarray, parameters: np.ndarray | None = None) -> None:
-        start = self._start(rows)
+    def _begin(self, rows: np.ndarray, ended: RobotState, parameters: np.ndarray | None = None) -> None:
+        start = self._start(rows, ended)
         self.goal = _replaced(self.goal, rows, self.task.region.sample(len(rows), self.generator))
         self.episode_length = _replaced(self.episode_length, rows, 0)
         self.episode_rewards = _replaced(self.episode_rewards, rows, 0.0)
@@ -150,8 +150,8 @@ class Simulation:
         self.last_command = _replaced(self.last_command, rows, standing)
         self._delay.reset(rows, standing, delay)
 
-    def _start(self, rows: np.ndarray) -> RobotState:
-        """Draw where the episodes of some rows begin, and within the limits."""
+    def _start(self, rows: np.ndarray, ended: RobotState) -> RobotState:
+        """Draw where the episodes of some rows begin: within the limits, or where the last ones ended."""
         config, spec, count = self.config.start, self.spec, len(rows)
         position = np.tile(spec.home, (count, 1))
         velocity = np.zeros_like(position)
@@ -160,8 +160,8 @@ class Simulation:
             position = np.clip(position + (2 * draw - 1) * np.array(config.spread), *spec.position_limit.T)
         if config.carried_over:
             carried = torch.rand(count, 1, generator=self.generator).numpy() < config.carried_over
-            position = np.where(carried, self.state.joint_position[rows], position)
-            velocity = np.where(carried, self.state.joint_velocity[rows], velocity)
+            position = np.where(carried, ended.joint_position[rows], position)
+            velocity = np.where(carried, ended.joint_velocity[rows], velocity)
         return RobotState(position, velocity)
 
     def _standing(self, state: RobotState) -> np.ndarray:
@@ -181,11 +181,11 @@ class Simulation:
             only terminates.
         """
         command = self.joint_command.of_arrays(action, self.state.joint_position, self.last_command)
-        self.last_command = command
+        self.last_command, before = command, self.state
         self.state = self.physics.step(self._delay(command))
         length = self.episode_length + 1
         if restart is not None and restart.any():
-            self._begin(rows := restart.nonzero()[0])
+            self._begin(rows := restart.nonzero()[0], before)
             length[rows] = 0
         else:
             rows = None

@@ -9,8 +9,9 @@ from physai.robots import RobotSpec
 
 DynamicsParameters = dict[str, np.ndarray]
 """Per robot and absolute, each [rows, k]: ``link_mass`` (kg, one a moving link), ``payload`` (kg at the tip, 1), and
-one a joint of ``joint_damping`` (N·m·s/rad), ``joint_friction`` (N·m), ``effort_limit`` (N·m), ``velocity_gain`` (the
-share of the missing velocity that a motor makes up for in a control period)."""
+one a joint of ``joint_damping`` (N·m·s/rad), ``joint_friction`` (N·m), ``effort_limit`` (N·m), ``velocity_gain`` (in
+(0, 1]: the share of the missing velocity that a motor makes up for in one control period of one step; at any number of
+substeps, a gain g is a motor with the time constant (1 - g) / g, in control periods)."""
 
 
 def nominal_dynamics(spec: RobotSpec) -> DynamicsParameters:

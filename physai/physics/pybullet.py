@@ -119,8 +119,9 @@ class PyBulletPhysics:
         limit, friction, gain = (
             self._parameters[key][rows] for key in ("effort_limit", "joint_friction", "velocity_gain")
         )
-        # Of the missing velocity, each substep makes up for as much as all of them shall together.
-        gain = 1.0 - (1.0 - np.minimum(gain, 1.0)) ** (1.0 / self.substeps)
+        # Applied once a substep: the time constant stays the same, and how far gravity pulls a joint down.
+        gain = np.minimum(gain, 1.0)
+        gain /= gain + self.substeps * (1.0 - gain)
         speeding, braking = np.maximum(limit - friction, 0.0), np.maximum(limit + friction, 0.0)
         n = len(self._joints)
         for row, *values in zip(rows.tolist(), speeding.tolist(), braking.tolist(), gain.tolist(), strict=True):

@@ -15,6 +15,12 @@ def spec(any_env):
     return RobotSpec.from_config(any_env.robot)
 
 
+def first_joints(config: RobotConfig, joints: int) -> RobotSpec:
+    """A KUKA that drives as many of its joints."""
+    changes = {"joints": SEVEN[:joints], "home": [0.0] * joints, "command_limit": [0.5] * joints}
+    return RobotSpec.from_config(RobotConfig.model_validate({**config.model_dump(), **changes}))
+
+
 def link_positions(spec: RobotSpec, joint_position: np.ndarray) -> np.ndarray:
     """Where PyBullet puts the frame of the end effector in the robot's own URDF; all other joints are at zero."""
     client = bullet.connect(bullet.DIRECT)
@@ -82,9 +88,7 @@ def test_a_joint_whose_urdf_names_no_axis_turns_about_x_as_pybullet_has_it(reach
 
 
 def test_all_seven_joints_of_the_kuka_match_pybullet(kuka_reacher):
-    lists = {"joints": SEVEN, "home": [0.0] * 7, "command_limit": [0.5] * 7}
-    config = RobotConfig.model_validate({**kuka_reacher.robot.model_dump(), **lists})
-    spec = RobotSpec.from_config(config)
+    spec = first_joints(kuka_reacher.robot, 7)
     joint_position = random_positions(200, 7)
     found = ForwardKinematics(spec)(joint_position).numpy()
     np.testing.assert_allclose(found, link_positions(spec, joint_position.numpy()), rtol=0, atol=1e-5)
@@ -117,7 +121,7 @@ def test_any_chain_of_turned_joints_matches_pybullet(tmp_path, seed):
         end_effector="l7",
         home=[0.0] * 3,
         command="joint_velocity",
-        command_limit=[0.5] * 3,
+        command_limit=[1.0] * 3,
         position_gain=20.0,
     )
     spec = RobotSpec.from_config(config)
@@ -171,30 +175,30 @@ def test_reach_bounds_the_distance_from_the_first_joint_and_is_attained_by_the_p
 
 
 def assert_same_in_numbers_and_arrays(spec):
-    kinematics = ForwardKinematics(spec).double()
+    expected = ForwardKinematics(spec).double()
     end_effector = EndEffector(ForwardKinematics(spec))
     joint_position = random_positions(200, len(spec.joints), seed=3).double()
-    expected = kinematics(joint_position).numpy()
-    q = joint_position.numpy()
-    np.testing.assert_allclose(end_effector(q), expected, rtol=0, atol=1e-12)
-    np.testing.assert_allclose([end_effector(row[None])[0] for row in q], expected, rtol=0, atol=1e-12)
+    q, positions = joint_position.numpy(), expected(joint_position).numpy()
+    many = end_effector(q)
+    assert many.shape == (200, 3)
+    np.testing.assert_allclose(many, positions, rtol=0, atol=1e-12)
+    one_by_one = [end_effector(row[None]) for row in q]
+    np.testing.assert_allclose(np.concatenate(one_by_one), positions, rtol=0, atol=1e-12)
 
 
-def test_the_end_effector_of_a_robot_is_to_the_last_bit_where_it_would_be_in_a_smaller_batch(spec):
+def test_the_end_effector_of_a_robot_is_to_the_last_bit_where_it_would_be_without_the_others(spec):
     end_effector = EndEffector(ForwardKinematics(spec))
     q = random_positions(64, len(spec.joints)).double().numpy()
     together = end_effector(q)
     for rows in (2, 3, 7):
-        alone = [end_effector(q[first : first + rows]) for first in range(0, 63, rows)]
-        np.testing.assert_array_equal(np.concatenate(alone)[:60], together[:60])
+        apart = [end_effector(q[first : first + rows]) for first in range(0, 63, rows)]
+        np.testing.assert_array_equal(np.concatenate(apart)[:63], together[:63])
 
 
-def test_the_end_effector_s_place_without_torch_is_that_of_the_module(spec):
+def test_the_end_effector_without_torch_is_that_of_the_module(spec):
     assert_same_in_numbers_and_arrays(spec)
 
 
 @pytest.mark.parametrize("joints", [1, 7])
-def test_the_end_effector_s_place_without_torch_is_that_of_the_module_for_any_number_of_joints(kuka_reacher, joints):
-    lists = {"home": [0.0] * joints, "command_limit": [0.5] * joints}
-    robot = {**kuka_reacher.robot.model_dump(), "joints": SEVEN[:joints], **lists}
-    assert_same_in_numbers_and_arrays(RobotSpec.from_config(RobotConfig.model_validate(robot)))
+def test_the_end_effector_without_torch_is_that_of_the_module_for_any_number_of_joints(kuka_reacher, joints):
+    assert_same_in_numbers_and_arrays(first_joints(kuka_reacher.robot, joints))

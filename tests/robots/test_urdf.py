@@ -144,9 +144,8 @@ def test_joints_out_of_order_twice_or_without_a_home_are_refused():
     assert "order" in message_of(CONFIG.urdf, joints=["joint2", "joint1"])
     assert "twice" in message_of(CONFIG.urdf, joints=["joint1", "joint1"])
     assert "home" in message_of(CONFIG.urdf, home=[0.0])
-    assert "command_limit" in message_of(CONFIG.urdf, command_limit=[1.0])
-    assert "'joint2', 2.5 rad/s" in message_of(CONFIG.urdf, command_limit=[1.0, 2.6])
-    assert "tool_mount" in message_of(CONFIG.urdf, joints=["joint1", "joint2", "tool_mount"], home=[0.0] * 3)
+    three = {"joints": ["joint1", "joint2", "tool_mount"], "home": [0.0] * 3, "command_limit": [1.0] * 3}
+    assert "tool_mount" in message_of(CONFIG.urdf, **three)
 
 
 def spec_or_user_error(folder: Path, data: bytes) -> None:
