@@ -126,7 +126,7 @@ def test_a_velocity_gain_means_the_same_at_any_number_of_substeps(any_env, spec,
         reset_all(physics, begin, parameters)
         found.append(run(physics, given)[:, 0])
     rms = [np.sqrt(np.mean((other - found[0]) ** 2)) for other in found[1:]]
-    assert max(rms) < (0.012 if any_env.name == "reacher" else 0.003)
+    assert max(rms) < (0.003 if any_env.name == "kuka_reacher" else 0.012)
     for key in ("velocity_gain", "effort_limit"):
         np.testing.assert_array_equal(physics.parameters()[key], parameters[key])
 
