@@ -123,16 +123,14 @@ from physai.tasks import Reach
 import os
 from torch.nn import Linear
 class Mine(Reach): pass
-mine = Mine(**{arguments})
+mine = Mine.__new__(Mine)
 """
 
 
 @pytest.fixture
 def own(run):
     """A run whose task is in a package of the user's."""
-    config = OmegaConf.load(run / ".hydra" / "config.yaml")
-    arguments = {key: value for key, value in OmegaConf.to_container(config.env.task).items() if key != "_target_"}
-    Path("mypackage.py").write_text(MINE.format(arguments=arguments))
+    Path("mypackage.py").write_text(MINE)
     malicious.edit(run, malicious.at("env.task._target_", "mypackage.Mine"))
     yield run
     sys.modules.pop("mypackage", None)

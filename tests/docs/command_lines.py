@@ -94,7 +94,7 @@ def _check_node(node: str, given: Sequence[str]) -> None:
         if option == "-p":
             parameters[name] = yaml.safe_load(meaning)
         elif option == "-r":
-            assert name in SOURCES, name
+            assert name in SOURCES or exists(name), name
             assert meaning.startswith("/")
         else:
             assert option == "--params-file", option
