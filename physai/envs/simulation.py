@@ -17,7 +17,10 @@ from physai.tasks import Step, Task
 
 _TASK = ("goal", "region", "tolerances", "module", "max_steps", "success", "terminated", "rewards")
 _PHYSICS = ("reset", "step", "robot_state", "close")
-_STATE = ("goal", "last_command", "episode_length", "episode_rewards", "physics_parameters", "within", "success")
+_STATE = (
+    *("goal", "last_command", "episode_length", "episode_rewards", "physics_parameters"),
+    *("within", "success", "started"),
+)
 
 
 def _says_whether_simulated(node: dict[str, Any]) -> dict[str, Any]:
@@ -80,6 +83,7 @@ class Simulation:
         episode_rewards: Sum of each term of the reward since the last reset, [N, terms].
         physics_parameters: Those in force, [N, P] (see :class:`physai.physics.ParameterLayout`).
         within: Control steps that the goal has been held, [N].
+        started: Whether there has been an episode since the last seed, [N]; before, none is carried over.
         reward_terms: Names of the terms.
     """
 
@@ -123,8 +127,9 @@ class Simulation:
         return (*signals, last)
 
     def seed(self, seed: int) -> None:
-        """Restart the random numbers of goals and start poses."""
+        """Restart the random numbers of goals and start poses; what follows does not depend on what was before."""
         self.generator.manual_seed(seed)
+        self.started = np.zeros(self.num_envs, bool)
 
     def reset(self, rows: np.ndarray | None = None, parameters: np.ndarray | None = None) -> None:
         """Start new episodes in the rows of a mask [N] (all by default), with new parameters [N, P] if given."""
@@ -133,6 +138,7 @@ class Simulation:
 
     def _begin(self, rows: np.ndarray, ended: RobotState, parameters: np.ndarray | None = None) -> None:
         start = self._start(rows, ended)
+        self.started = _replaced(self.started, rows, True)
         self.goal = _replaced(self.goal, rows, self.task.region.sample(len(rows), self.generator))
         self.episode_length = _replaced(self.episode_length, rows, 0)
         self.episode_rewards = _replaced(self.episode_rewards, rows, 0.0)
@@ -160,6 +166,7 @@ class Simulation:
             position = np.clip(position + (2 * draw - 1) * np.array(config.spread), *spec.position_limit.T)
         if config.carried_over:
             carried = torch.rand(count, 1, generator=self.generator).numpy() < config.carried_over
+            carried &= self.started[rows, None]
             position = np.where(carried, ended.joint_position[rows], position)
             velocity = np.where(carried, ended.joint_velocity[rows], velocity)
         return RobotState(position, velocity)

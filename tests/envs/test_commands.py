@@ -191,6 +191,6 @@ def assert_equal(ours, theirs):
     """Equal in all that a simulation shows."""
     for key in ("joint_position", "joint_velocity"):
         np.testing.assert_array_equal(getattr(ours.state, key), getattr(theirs.state, key), err_msg=key)
-    shown = ("goal", "error", "success", "last_command", "episode_length", "episode_rewards", "within")
+    shown = ("goal", "error", "success", "last_command", "episode_length", "episode_rewards", "within", "started")
     for key in (*shown, "physics_parameters"):
         np.testing.assert_array_equal(getattr(ours, key), getattr(theirs, key), err_msg=key)
