@@ -180,7 +180,6 @@ class Controller:
         """Wait for a new goal; return whether there was one."""
         had = self._goal is not None
         self._goal, self._reached, self._gave_up = None, False, ""
-        self._progress.restart()
         return had
 
     def snapshot(self) -> dict[str, Any]:

@@ -15,7 +15,7 @@ from physai.signals import Quantity, Signal
 from physai.targets import Target, find, make
 from physai.tasks import Step, Task
 
-_TASK = ("goal", "region", "tolerances", "module", "max_steps", "success", "terminated", "rewards")
+_TASK = ("goal", "region", "tolerances", "observation", "module", "max_steps", "success", "terminated", "rewards")
 _PHYSICS = ("reset", "step", "robot_state", "close")
 _STATE = (
     *("goal", "last_command", "episode_length", "episode_rewards", "physics_parameters"),
