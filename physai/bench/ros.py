@@ -25,7 +25,7 @@ from physai.bench.timing import table
 from physai.deploy import read_metadata
 from physai.errors import UserError
 from physai.ros import qos
-from physai.ros.commands import topic
+from physai.ros.commands import controller_topic
 from physai.ros.processes import NodeProcess
 from physai.ros.run import prepare_middleware
 from physai.signals import Quantity
@@ -37,7 +37,7 @@ STATE_RATE = 100.0  # Hz
 _PATIENCE = 30.0
 _NODE, _BARE = "physai.ros.inference_node", "physai.bench.bare_node"
 
-TOPIC = topic(Quantity.JOINT_VELOCITY)
+TOPIC = controller_topic(Quantity.JOINT_VELOCITY)
 
 
 @dataclass

@@ -19,7 +19,7 @@ from std_srvs.srv import Trigger
 
 from physai.deploy.parameters import Parameters, parameter
 from physai.ros import qos
-from physai.ros.commands import JointCommands, topic
+from physai.ros.commands import JointCommands
 from physai.ros.parameters import declare
 from physai.ros.run import StoppableNode, run
 from physai.signals import Quantity
@@ -50,9 +50,9 @@ class CommandWatchdog(StoppableNode):
         self._config = config = declare(self, WatchdogConfig, self._configure)
         # Before the commands: who hears of these knows then that they are ours.
         self._heartbeat = self.create_publisher(Empty, "~/heartbeat", qos.COMMAND, event_callbacks=qos.SILENT_PUBLISHER)
-        self._commands = JointCommands(self, config.joints, topic(Quantity(config.command)), partners="~/commands")
+        self._commands = JointCommands(self, config.joints, Quantity(config.command), partners="~/commands")
         self._joints = config.joints
-        self._positions, self._passed = config.command == Quantity.JOINT_POSITION, False
+        self._positions = config.command == Quantity.JOINT_POSITION
         self._source: Subscription | None = None
         self._last = -math.inf
         self._looked = time.monotonic()
@@ -84,7 +84,7 @@ class CommandWatchdog(StoppableNode):
         else:
             self._commands.send(command)
             if self._positions:
-                self._commands.still, self._passed = command, True
+                self._commands.still = command
             if self._reason:
                 self.get_logger().info("passing commands on again")
             self._reason = ""
@@ -129,7 +129,7 @@ class CommandWatchdog(StoppableNode):
     @property
     def _can_stop(self) -> bool:
         """Whether it is known what stands still: positions only once some have been passed on."""
-        return self._passed if self._positions else self._joints > 0
+        return bool(self._commands.still)
 
     def _stop(self, reason: str) -> None:
         if not self._can_stop:

@@ -17,7 +17,7 @@ _LAST, _PERIOD = 5, 0.02  # s
 _ACKNOWLEDGED = 0.5  # s
 
 
-def topic(quantity: Quantity) -> str:
+def controller_topic(quantity: Quantity) -> str:
     """Where ros2_control's controller of joint velocities or positions takes commands."""
     return f"/{quantity.value}_controller/commands"
 
@@ -28,20 +28,27 @@ class JointCommands:
     Args:
         node: Whose remaps hold.
         joints: How many numbers a command has.
-        topic: Where to.
+        quantity: What they are, joint velocities or joint positions.
+        topic: Where to; None for the controller itself.
         partners: Who publishes this other topic may publish here, too; empty if nobody may.
 
     Attributes:
         timeout: A way to the controller that was silent for longer is lost, s; of use where it tells that it lives.
         silences: How often it was lost.
-        still: The command that stands still: zero velocities, or positions that whoever commands keeps up to date.
+        still: The command that stands still: zero velocities, or positions that whoever commands keeps up to date;
+            None while these are not known.
     """
 
     timeout, silences = math.inf, 0
 
-    def __init__(self, node: Node, joints: int, topic: str, partners: str = "") -> None:
+    still: Sequence[float] | None
+
+    def __init__(
+        self, node: Node, joints: int, quantity: Quantity, topic: str | None = None, partners: str = ""
+    ) -> None:
+        self._stops_at_zero = quantity is Quantity.JOINT_VELOCITY
         self._publisher = node.create_publisher(
-            Float64MultiArray, topic, qos.COMMAND, event_callbacks=qos.SILENT_PUBLISHER
+            Float64MultiArray, topic or controller_topic(quantity), qos.COMMAND, event_callbacks=qos.SILENT_PUBLISHER
         )
         self.topic: str = self._publisher.topic_name
         self._companions = Companions(node, self.topic, partners)
@@ -51,7 +58,7 @@ class JointCommands:
     def resize(self, joints: int) -> None:
         """Take another number of joints in a command."""
         self._message.data = array("d", [0.0] * joints)
-        self.still: Sequence[float] = [0.0] * joints
+        self.still = [0.0] * joints if self._stops_at_zero else None
 
     @property
     def rival(self) -> str | None:
@@ -75,8 +82,9 @@ class JointCommands:
         self._publisher.publish(self._message)
 
     def stop(self) -> None:
-        """Publish the command that stands still."""
-        self.send(self.still)
+        """Publish the command that stands still, if it is known: a position that is made up would move the arm."""
+        if self.still is not None:
+            self.send(self.still)
 
     def finish(self) -> None:
         """Stop until this has surely arrived: a reliable writer of depth 1 forgets what it has replaced."""

@@ -16,7 +16,7 @@ from std_msgs.msg import String
 from physai.deploy import Policy, State
 from physai.errors import UserError
 from physai.ros import goals, qos
-from physai.ros.commands import topic
+from physai.ros.commands import controller_topic
 from physai.ros.processes import NodeProcess
 from physai.ros.run import prepare_middleware
 from physai.signals import Tolerance
@@ -120,7 +120,7 @@ class GoalClient:
         end = time.monotonic() + _LOOK
         while time.monotonic() < end:
             self._executor.spin_once(0.05)
-            commands = topic(self._metadata.command.quantity)
+            commands = controller_topic(self._metadata.command.quantity)
             for name, others in (
                 (commands, self._node.count_subscribers(commands) + self._node.count_publishers(commands)),
                 ("/joint_states", self._node.count_publishers("/joint_states")),

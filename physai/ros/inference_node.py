@@ -17,7 +17,7 @@ from physai.deploy.goals import GoalError, accept
 from physai.deploy.parameters import parameter
 from physai.errors import UserError
 from physai.ros import goals, outlet, qos
-from physai.ros.commands import JointCommands, topic
+from physai.ros.commands import JointCommands
 from physai.ros.diagnostics import Timing, diagnose
 from physai.ros.emergency_stop import TOPIC as EMERGENCY_STOP
 from physai.ros.emergency_stop import EmergencyStopTopic
@@ -88,7 +88,7 @@ class InferenceNode(StoppableNode):
         self._moving = False
         self._takes_positions = policy.metadata.command.quantity is Quantity.JOINT_POSITION
 
-        self._commands = _commands(self, len(joints), topic(policy.metadata.command.quantity), config)
+        self._commands = _commands(self, len(joints), policy.metadata.command.quantity, config)
         self._states = self.create_publisher(String, "~/state", qos.LATCHED)
         self._estopped = self.create_publisher(Bool, "~/estopped", qos.LATCHED)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
@@ -250,7 +250,8 @@ class InferenceNode(StoppableNode):
         if command.value is None or silent or not self._publishing:
             return
         if self._takes_positions:
-            self._commands.still = self._in_order(self._controller.standstill)
+            moves = command.state is State.ACTIVE
+            self._commands.still = self._in_order(self._controller.standstill if moves else command.value)
         self._commands.send(self._in_order(command.value))
         self._moving = command.state is State.ACTIVE
 
@@ -297,11 +298,11 @@ class InferenceNode(StoppableNode):
         self._stop_file.close(_DISK)
 
 
-def _commands(node: InferenceNode, joints: int, topic: str, config: InferenceConfig) -> JointCommands:
+def _commands(node: InferenceNode, joints: int, quantity: Quantity, config: InferenceConfig) -> JointCommands:
     if not config.watchdog:
-        return JointCommands(node, joints, topic)
+        return JointCommands(node, joints, quantity)
     try:
-        return WatchedCommands(node, joints, topic, config.watchdog, config.watchdog_timeout)
+        return WatchedCommands(node, joints, quantity, config.watchdog, config.watchdog_timeout)
     except (NameValidationException, RuntimeError) as error:  # RuntimeError: RCLError
         raise UserError(f"watchdog: must be the name of a node, got '{config.watchdog}': {brief(error)}") from None
 

@@ -28,8 +28,8 @@ from physai.signals import Quantity
 
 TOPICS = (
     "/joint_states",
-    commands.topic(Quantity.JOINT_VELOCITY),
-    commands.topic(Quantity.JOINT_POSITION),
+    commands.controller_topic(Quantity.JOINT_VELOCITY),
+    commands.controller_topic(Quantity.JOINT_POSITION),
     "/command_watchdog/commands",
     "/inference_node/goal",
     "/inference_node/state",

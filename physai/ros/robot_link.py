@@ -18,7 +18,7 @@ from std_srvs.srv import Trigger
 
 from physai.errors import UserError
 from physai.ros import qos
-from physai.ros.commands import JointCommands, topic
+from physai.ros.commands import JointCommands
 from physai.ros.run import brief, prepare_middleware
 from physai.signals import Quantity
 
@@ -65,7 +65,7 @@ class RobotLink:
         self._received, self._stamp, self._refused = -math.inf, -1, ""
         self._state = np.full((2, len(self._joints)), np.nan)
         self._sent, self._moving, self._used, self._closed = -math.inf, False, False, False
-        self._commands = JointCommands(self._node, len(self._joints), topic(Quantity.JOINT_VELOCITY))
+        self._commands = JointCommands(self._node, len(self._joints), Quantity.JOINT_VELOCITY)
         self._states = self._node.create_subscription(
             JointState,
             "/joint_states",

@@ -14,7 +14,7 @@ from physai.deploy import JointState
 from physai.deploy.parameters import parameter
 from physai.errors import UserError
 from physai.ros import qos
-from physai.ros.commands import topic
+from physai.ros.commands import controller_topic
 from physai.ros.faults import FaultConfig, Faults
 from physai.ros.parameters import declare
 from physai.ros.run import StoppableNode, run
@@ -63,7 +63,7 @@ class VirtualRobot(StoppableNode):
         self._controller = GroupController(rest, self._arm.spec.command, config.command_timeout)
         self._faults = Faults(config, config.seed)
         self._states = self.create_publisher(JointStateMessage, "/joint_states", 10)
-        commands = topic(self._arm.spec.command)
+        commands = controller_topic(self._arm.spec.command)
         self.create_subscription(Float64MultiArray, commands, self._take_command, qos.COMMAND)
         self.create_service(Trigger, "~/reset", self._reset)
         self.create_timer(1.0 / config.rate_hz, self._step, clock=Clock(clock_type=ClockType.STEADY_TIME))

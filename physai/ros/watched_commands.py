@@ -9,6 +9,7 @@ from std_msgs.msg import Empty
 
 from physai.ros import qos
 from physai.ros.commands import JointCommands
+from physai.signals import Quantity
 
 
 class WatchedCommands(JointCommands):
@@ -17,7 +18,7 @@ class WatchedCommands(JointCommands):
     Args:
         node: Whose remaps hold.
         joints: How many numbers a command has.
-        topic: Where the controller takes commands.
+        quantity: What they are, joint velocities or joint positions.
         watchdog: Name of its node, such as ``/command_watchdog``.
         timeout: A watchdog that was silent for longer does not answer, s.
 
@@ -25,10 +26,10 @@ class WatchedCommands(JointCommands):
         silences: How often it has ceased to answer.
     """
 
-    def __init__(self, node: Node, joints: int, topic: str, watchdog: str, timeout: float) -> None:
-        super().__init__(node, joints, f"{watchdog}/commands")
+    def __init__(self, node: Node, joints: int, quantity: Quantity, watchdog: str, timeout: float) -> None:
+        super().__init__(node, joints, quantity, f"{watchdog}/commands")
         # There from the start: what has to be found first is late.
-        self._past = JointCommands(node, joints, topic, partners=f"{watchdog}/heartbeat")
+        self._past = JointCommands(node, joints, quantity, partners=f"{watchdog}/heartbeat")
         node.create_subscription(
             Empty,
             f"{watchdog}/heartbeat",

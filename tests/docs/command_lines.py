@@ -18,7 +18,7 @@ from physai.evaluate import EvaluateConfig
 from physai.export import ExportConfig
 from physai.play import PlayConfig
 from physai.plot import PlotConfig
-from physai.ros.commands import topic
+from physai.ros.commands import controller_topic
 from physai.ros.demo import DemoConfig
 from physai.signals import Quantity
 from physai.training.config import TrainConfig
@@ -145,7 +145,7 @@ def _check_ros2(given: Sequence[str]) -> None:
 def exists(name: str) -> bool:
     """Whether the code knows a topic or service; those of a node are ``~/name`` there."""
     node, _, private = name.removeprefix("/").partition("/")
-    if name in (topic(Quantity.JOINT_VELOCITY), topic(Quantity.JOINT_POSITION)):
+    if name in (controller_topic(Quantity.JOINT_VELOCITY), controller_topic(Quantity.JOINT_POSITION)):
         return True
     return f'"{name}"' in SOURCES or (node in hooks()["PARAMETERS"] and f'"~/{private}"' in SOURCES)  # type: ignore[operator]
 

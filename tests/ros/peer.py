@@ -29,12 +29,12 @@ from std_srvs.srv import SetBool, Trigger
 
 from physai.processes import die_with
 from physai.ros import qos
-from physai.ros.commands import topic
+from physai.ros.commands import controller_topic
 from physai.signals import Quantity
 
 SHM = Path("/dev/shm")
 
-TOPIC = topic(Quantity.JOINT_VELOCITY)
+TOPIC = controller_topic(Quantity.JOINT_VELOCITY)
 
 
 def wait_for(condition: Callable[[], Any], timeout: float = 20.0, what: str = "") -> Any:
