@@ -55,6 +55,16 @@ def pytest_runtest_protocol(item: pytest.Item, nextitem: pytest.Item | None) -> 
     return True
 
 
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    if hasattr(session.config, "workeroutput"):  # a worker of xdist tells the process that tells the user
+        session.config.workeroutput["repeated"] = session.config.stash[REPEATED]
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_testnodedown(node: Any, error: Any) -> None:
+    node.config.stash[REPEATED].extend(getattr(node, "workeroutput", {}).get("repeated", []))
+
+
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:
     if config.stash[REPEATED]:
         terminalreporter.section("repeated: the machine stood still")

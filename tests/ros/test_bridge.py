@@ -77,6 +77,7 @@ def test_a_second_env_takes_the_robot_over_and_the_first_says_so(start_robot, ma
     second.step(second.action_space.sample())
 
 
+@pytest.mark.realtime
 def test_an_episode_over_ros_is_the_episode_in_process(start_robot, make):
     start_robot()
     ours = make()

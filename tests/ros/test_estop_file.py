@@ -72,6 +72,7 @@ def test_where_nothing_can_be_written_it_says_so(monkeypatch, tmp_path):
     assert closed(EmergencyStopFile(NODE, 7)).unusable == f"{tmp_path / 'file' / 'physai'}: Not a directory"
 
 
+@pytest.mark.realtime
 def test_a_disk_that_refuses_is_told_of_and_asked_again(home):
     file = EmergencyStopFile(NODE, 7)
     home.rmdir()
@@ -102,6 +103,7 @@ def test_a_change_that_half_succeeded_is_made_again(home, monkeypatch):
     assert file.path.exists()
 
 
+@pytest.mark.realtime
 def test_a_disk_that_stands_still_keeps_nobody_waiting(home, monkeypatch):
     file, go = EmergencyStopFile(NODE, 7), threading.Event()
     monkeypatch.setattr("os.fsync", lambda _: go.wait(10.0))

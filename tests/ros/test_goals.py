@@ -18,6 +18,7 @@ BAD = {
 }
 
 
+@pytest.mark.realtime
 @pytest.mark.parametrize("name", BAD)
 def test_a_bad_goal_is_refused_with_a_reason_and_the_old_one_stays(loop, name):
     goal, reason = BAD[name]

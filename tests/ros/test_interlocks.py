@@ -124,6 +124,7 @@ def test_a_controller_that_leaves_and_returns_stops_the_arm_in_between(policy_pa
             peer.close()
 
 
+@pytest.mark.realtime
 def test_it_drives_only_after_enable_unless_told_to_start_by_itself(policy_path):
     with closed_loop(policy_path, autostart=False, goal=GOAL) as loop:
         waits_because_of(loop, "not enabled")
@@ -142,6 +143,7 @@ def test_it_drives_only_after_enable_unless_told_to_start_by_itself(policy_path)
         loop.peer.moved(after=since)
 
 
+@pytest.mark.realtime
 def test_a_clock_of_a_simulation_that_stands_still_or_is_missing_changes_nothing(policy_path):
     with closed_loop(policy_path, use_sim_time=True, goal=GOAL) as loop:
         for clock in (None, 5, 5, 7):

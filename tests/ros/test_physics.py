@@ -68,6 +68,7 @@ def zeros_last(peer):
     return peer.commands and not any(peer.commands[-1][1])
 
 
+@pytest.mark.realtime
 def test_steps_take_a_control_period_and_do_not_drift(start_robot, connect):
     start_robot()
     physics = connect()
@@ -82,6 +83,7 @@ def test_steps_take_a_control_period_and_do_not_drift(start_robot, connect):
     assert periods.mean() == pytest.approx(20.0, abs=1.0)
 
 
+@pytest.mark.realtime
 def test_a_caller_who_is_late_gets_whole_periods_again(start_robot, connect):
     start_robot()
     physics = connect()
@@ -94,6 +96,7 @@ def test_a_caller_who_is_late_gets_whole_periods_again(start_robot, connect):
         assert time.monotonic() - before >= periods * DT
 
 
+@pytest.mark.realtime
 def test_joints_are_mapped_by_name_and_others_ignored(start_robot, connect):
     start_robot("-p", "state_joints:=[gripper, joint2, joint1]")
     physics = connect()
@@ -104,6 +107,7 @@ def test_joints_are_mapped_by_name_and_others_ignored(start_robot, connect):
     np.testing.assert_allclose(qd[0], [0.5, -0.25], atol=0.02)
 
 
+@pytest.mark.realtime
 def test_the_reset_service_puts_a_virtual_robot_home_at_once(start_robot, connect):
     start_robot()
     physics = connect()
@@ -145,6 +149,7 @@ def test_an_arm_that_does_not_get_to_its_start_is_named(start_robot, connect, pe
     wait_for(lambda: zeros_last(peer))
 
 
+@pytest.mark.realtime
 def test_a_robot_that_falls_silent_is_stopped_and_can_be_used_again(start_robot, connect, peer):
     robot = start_robot()
     physics = connect()
@@ -222,6 +227,7 @@ def test_a_rival_who_comes_later_ends_the_episode_with_zeros(start_robot, connec
     move(physics, [0.5, 0.5], 2)
 
 
+@pytest.mark.realtime
 def test_an_arm_whose_caller_pauses_is_stopped(start_robot, connect, peer):
     start_robot()
     physics = connect()
@@ -283,6 +289,7 @@ def test_what_a_robot_behind_ros_cannot_do_is_refused_in_one_line(start_robot, c
     physics.close()
 
 
+@pytest.mark.realtime
 def test_topics_can_have_other_names(start_robot, connect):
     start_robot("-r", "/joint_states:=/left/joint_states", "-r", f"{TOPIC}:=/left/commands")
     physics = connect(remap=["/joint_states:=/left/joint_states", f"{TOPIC}:=/left/commands"])

@@ -62,6 +62,7 @@ def start_recorder(start, folder: Path, *topics: str):
     return recorder
 
 
+@pytest.mark.realtime
 @pytest.mark.parametrize(
     ("kind", "end"),
     [
@@ -84,6 +85,7 @@ def test_every_message_is_there_once(start, peer, tmp_path, kind, end):
     assert recorder.says(f"recorded to {tmp_path / 'bag'}")
 
 
+@pytest.mark.realtime
 def test_publishers_of_all_kinds_share_a_topic(start, peer, tmp_path):
     early = peer.publisher(UInt64, "/numbers", KINDS["latched"])
     for number in range(10):
@@ -105,6 +107,7 @@ def same_end(some: list, others: list) -> bool:
     return length > 0 and some[-length:] == others[-length:]
 
 
+@pytest.mark.realtime
 def test_a_session_is_recorded_as_it_was(start, peer, policy_path, tmp_path):
     estopped, joint_states = [], []
     peer.listen(Bool, "/inference_node/estopped", estopped, KINDS["latched"], lambda message: message.data)
@@ -163,6 +166,7 @@ def test_a_session_is_recorded_as_it_was(start, peer, policy_path, tmp_path):
             assert 0 <= len(data) - len(TYPES.serialize_cdr(message, connection.msgtype)) < 4
 
 
+@pytest.mark.realtime
 def test_a_killed_recording_is_completed(start, peer, tmp_path):
     bag = tmp_path / "bag"
     recorder = start_recorder(start, bag, "/numbers", "/joint_states")

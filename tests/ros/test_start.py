@@ -103,6 +103,7 @@ def test_bad_parameters_are_refused(files, refused, policy_path):
     )
 
 
+@pytest.mark.realtime
 def test_whole_numbers_are_taken_for_floats_and_misspelt_names_warn_with_the_nearest(policy_path, tmp_path):
     file = tmp_path / "robot.yaml"
     file.write_text("inference_node:\n  ros__parameters:\n    max_velocty: 0.1\n    max_acceleration: 3\n    xyz: 1\n")

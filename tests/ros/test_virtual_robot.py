@@ -103,6 +103,7 @@ def test_a_command_of_a_wrong_length_makes_it_deaf_until_a_reset(robot):
     robot.settles_at(0.3, 0.3)
 
 
+@pytest.mark.realtime
 def test_states_come_a_hundred_times_a_second_in_order(robot):
     since = time.monotonic()
     wait_for(lambda: robot.peer.joint_states[-1][0] > since + 2.0)
@@ -120,6 +121,7 @@ def test_a_command_timeout_can_be_set_while_it_moves(robot):
     robot.settles_at(0.0, 0.0)
 
 
+@pytest.mark.realtime
 def test_each_fault_can_be_switched_on_and_off_while_it_runs(robot):
     def seen(count: int = 60):
         robot.state()
@@ -162,6 +164,7 @@ def test_joints_are_commanded_and_shown_in_the_order_that_is_asked_for(other):
     assert (message.position[0], message.position[2]) == (0.0, 0.0)
 
 
+@pytest.mark.realtime
 @pytest.mark.slow
 def test_the_inference_node_lives_with_faults_that_leave_enough_and_stops_for_the_others(start, peer, policy_path):
     start("virtual_robot", joints="[joint2, joint1]", state_joints="[joint2, lid, joint1]", randomization="strong")

@@ -40,6 +40,7 @@ def drive(watched):
     return watched.loop.start_from_here()
 
 
+@pytest.mark.realtime
 @pytest.mark.parametrize("number", [signal.SIGSTOP, signal.SIGKILL])
 @pytest.mark.fault("watchdog silent for `watchdog_timeout` (0.1 s)")
 def test_the_node_stops_the_arm_of_a_watchdog_that_hangs_or_dies_and_goes_on_when_it_is_back(watched, number):
@@ -64,6 +65,7 @@ def test_the_node_stops_the_arm_of_a_watchdog_that_hangs_or_dies_and_goes_on_whe
     assert max(map(abs, first)) <= 0.05  # two periods of the acceleration limit at most
 
 
+@pytest.mark.realtime
 @pytest.mark.fault("node silent for the watchdog's `timeout` (0.1 s)")
 def test_the_watchdog_stops_the_arm_of_a_node_that_hangs(watched):
     drive(watched)
@@ -107,6 +109,7 @@ def test_another_commander_of_the_watchdog_is_a_rival_of_the_node(watched):
     watched.peer.node.destroy_publisher(rival)
 
 
+@pytest.mark.realtime
 def test_a_node_whose_watchdog_never_came_waits_without_a_word(policy_path):
     with closed_loop(policy_path, watchdog=NAME, goal=list(FAR)) as loop:
         wait_for(lambda: SILENT in loop.diagnosis()[1])
