@@ -30,7 +30,9 @@ settings.load_profile("physai")
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     # An option of its own: of two -m, which a user may have given too, only the last counts.
-    parser.addoption("--realtime", choices=("only", "without"), help="choose by what measures time (the marker realtime)")
+    parser.addoption(
+        "--realtime", choices=("only", "without"), help="choose by what measures time (the marker realtime)"
+    )
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:

@@ -7,8 +7,9 @@ from array import array
 import pytest
 from std_msgs.msg import Float64MultiArray
 
+from tests.ros.forge import forged
 from tests.ros.loop import FAR
-from tests.ros.peer import TOPIC, Peer, Process, free_domain, node_command, wait_for
+from tests.ros.peer import TOPIC, Peer, free_domain, wait_for
 
 NODE = "/virtual_robot"
 
@@ -18,7 +19,7 @@ class Robot:
 
     def __init__(self, domain: int, **parameters) -> None:
         self.peer = Peer(domain)
-        self.process = Process(node_command("virtual_robot", **parameters), domain)
+        self.process = forged("virtual_robot", domain, **parameters)
         commands = self.peer.publisher(Float64MultiArray, TOPIC, 1)
         # The peer listens, too.
         wait_for(lambda: commands.get_subscription_count() == 2 and self.peer.joint_states, what="the robot")
