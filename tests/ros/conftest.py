@@ -108,7 +108,7 @@ def start(domain: int, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cal
     start.run = lambda command, env=None: processes.append(Process(command, domain, own | (env or {}))) or processes[-1]
     yield start
     with ThreadPoolExecutor() as pool:
-        list(pool.map(Process.end, processes))
+        list(pool.map(lambda process: process.end(), processes))
 
 
 @pytest.fixture
