@@ -25,11 +25,11 @@ def alive(pid: int) -> bool:
 
 
 @pytest.mark.slow
-def test_ten_goals_are_reached_and_held_for_three_seconds_and_the_path_is_drawn(start, policy_path, tmp_path):
+def test_goals_are_reached_and_held_for_three_seconds_and_the_path_is_drawn(start, policy_path, tmp_path):
     picture = tmp_path / "path.png"
-    process = start.run(demo(f"policy_path={policy_path}", f"output={picture}"))
-    assert process.wait(240) == 0, process.output
-    assert "10 of 10 goals reached, and held for 3 s" in process.output
+    process = start.run(demo(f"policy_path={policy_path}", f"output={picture}", "goals=5"))
+    assert process.wait(150) == 0, process.output
+    assert "5 of 5 goals reached, and held for 3 s" in process.output
     image = imageio.imread(picture)
     assert image.shape[0] > 400
     assert image.std() > 10

@@ -117,8 +117,8 @@ def test_ros_finds_an_installed_wheel(venv):
             "from ament_index_python.packages import get_package_prefix, get_package_share_directory as share\n"
             "import physai; print(get_package_prefix('physai'), share('physai'), physai.__file__)",
         ],
-        env=environment(venv),
-        cwd=venv,  # not where the source is
+        env=environment(venv) | {"PYTHONPATH": ""},
+        cwd=venv,  # not where the source is, either
         capture_output=True,
         text=True,
         check=True,
