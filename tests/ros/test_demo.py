@@ -45,6 +45,7 @@ def test_a_policy_that_commands_positions_drives_an_arm_that_takes_them(start, p
     assert picture.is_file()
 
 
+@pytest.mark.slow
 def test_it_refuses_to_start_where_a_robot_is_already(start, policy_path):
     start("virtual_robot").says("takes joint_velocity")
     process = start.run(demo(f"policy_path={policy_path}"))
@@ -53,6 +54,7 @@ def test_it_refuses_to_start_where_a_robot_is_already(start, policy_path):
     assert "ROS_DOMAIN_ID" in process.lines[-1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
 def test_its_nodes_end_with_it_however_it_ends(start, policy_path, number, tmp_path):
     process: Process = start.run(demo(f"policy_path={policy_path}", f"output={tmp_path / 'path.png'}"))
@@ -64,6 +66,7 @@ def test_its_nodes_end_with_it_however_it_ends(start, policy_path, number, tmp_p
     wait_for(lambda: not any(map(alive, nodes)), 10, "the nodes' end")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("override", "line"),
     [

@@ -49,6 +49,7 @@ def test_timing_gives_mean_rate_and_largest_deviation(periods):
     assert summary["jitter_ms"] == pytest.approx(1e3 * max(abs(p - mean) for p in periods), rel=1e-6, abs=0.002)
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 def test_diagnostics_come_every_second_and_with_every_change(loop, policy_path):
     loop.rest()

@@ -116,6 +116,7 @@ def test_a_disk_that_stands_still_keeps_nobody_waiting(home, monkeypatch):
     go.set()
 
 
+@pytest.mark.slow
 @pytest.mark.fault("emergency stop, then killed and started again")
 def test_a_node_killed_in_an_emergency_stop_is_in_it_when_it_starts_again(policy_path, peer, tmp_path):
     with closed_loop(policy_path, peer=peer, state=tmp_path, goal=list(FAR)) as loop:
@@ -143,6 +144,7 @@ def test_a_node_killed_in_an_emergency_stop_is_in_it_when_it_starts_again(policy
     assert list((tmp_path / "physai").iterdir()) == []
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not os.path.exists("/proc/self/status"), reason="needs a folder that even root cannot write to")
 @pytest.mark.fault("the folder for that cannot be written")
 def test_without_a_place_to_remember_it_a_node_does_not_start_by_itself(policy_path):

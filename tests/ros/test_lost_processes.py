@@ -112,6 +112,7 @@ def test_a_robot_with_a_command_timeout_stops_without_its_node(driven, peer):
     assert 0.15 < stands - last < 0.3
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 def test_a_paused_robot_of_this_process_stops_the_arm_within_the_timeout(policy_path):
     with closed_loop(policy_path, goal=list(FAR)) as loop:

@@ -121,6 +121,7 @@ def test_an_end_waits_half_a_second_for_output_that_does_not_flow(tmp_path):
         assert time.monotonic() - since < 1.5
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 @pytest.mark.parametrize(
     ("kind", "reasons"),
@@ -178,6 +179,7 @@ def test_a_watchdog_stops_the_arm_all_the_same(tmp_path, kind):
             peer.close()
 
 
+@pytest.mark.slow
 def test_a_recorder_goes_on_recording(tmp_path):
     bag = tmp_path / "bag"
     with blocked("terminal", tmp_path) as output, free_domain() as domain:
@@ -193,6 +195,7 @@ def test_a_recorder_goes_on_recording(tmp_path):
     assert numbers(bag) == list(range(300))
 
 
+@pytest.mark.slow
 @pytest.mark.fault("output stopped, full or closed")
 def test_a_closed_error_output_is_no_socket_of_the_middleware(start, peer, policy_path):
     command = shlex.join(node_command("inference_node", policy_path=policy_path, autostart=True, goal=list(FAR)))

@@ -141,6 +141,7 @@ def test_executables_are_all_the_same():
     assert len({(path.read_text(), path.stat().st_mode) for path in (PACKAGE / "lib").iterdir()}) == 1
 
 
+@pytest.mark.slow
 def test_nodes_take_the_config_file_without_a_warning(start, peer, tmp_path):
     file = ["--params-file", str(PACKAGE / "config" / "physai.yaml")]
     nodes = {
@@ -223,6 +224,7 @@ def test_the_launch_file_names_what_there_is(launch_file):
     assert arguments[0].default is None  # required
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("use_watchdog", ["true", "false"])
 def test_the_launch_file_drives_the_virtual_robot(launch_file, start, peer, policy_path, tmp_path, use_watchdog):
     parameters = tmp_path / "mine.yaml"

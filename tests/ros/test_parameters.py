@@ -156,6 +156,7 @@ def test_every_parameter_is_described_and_has_a_line_of_help(kind):
     assert "(rad/s, 0.001 to 100)" in help_text(ControllerConfig)
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 def test_a_lower_velocity_takes_effect_at_once_while_the_arm_moves(loop):
     loop.start()

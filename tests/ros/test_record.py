@@ -62,6 +62,7 @@ def start_recorder(start, folder: Path, *topics: str):
     return recorder
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 @pytest.mark.parametrize(
     ("kind", "end"),
@@ -85,6 +86,7 @@ def test_every_message_is_there_once(start, peer, tmp_path, kind, end):
     assert recorder.says(f"recorded to {tmp_path / 'bag'}")
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 def test_publishers_of_all_kinds_share_a_topic(start, peer, tmp_path):
     early = peer.publisher(UInt64, "/numbers", KINDS["latched"])
@@ -107,6 +109,7 @@ def same_end(some: list, others: list) -> bool:
     return length > 0 and some[-length:] == others[-length:]
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 def test_a_session_is_recorded_as_it_was(start, peer, policy_path, tmp_path):
     estopped, joint_states = [], []
@@ -166,6 +169,7 @@ def test_a_session_is_recorded_as_it_was(start, peer, policy_path, tmp_path):
             assert 0 <= len(data) - len(TYPES.serialize_cdr(message, connection.msgtype)) < 4
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 def test_a_killed_recording_is_completed(start, peer, tmp_path):
     bag = tmp_path / "bag"
@@ -209,6 +213,7 @@ def test_a_full_disk_ends_a_recording_in_one_line(start, peer, tmp_path):
     assert all(message.data == "x" * 10_000 for _, message in read(bag, "/text", String))
 
 
+@pytest.mark.slow
 def test_what_cannot_be_recorded_is_named_and_left_out(start, peer, tmp_path):
     hidden = "import sys; sys.modules['stereo_msgs.msg'] = None; from physai.ros.record import main; sys.exit(main())"
     parameters = ["-p", f"output:={tmp_path / 'bag'}", "-p", "topics:=[/disparity, /goals, /numbers]"]
@@ -225,6 +230,7 @@ def test_what_cannot_be_recorded_is_named_and_left_out(start, peer, tmp_path):
     assert recorder.output.count("is not recorded") == 2
 
 
+@pytest.mark.slow
 def test_it_ends_by_itself(start, tmp_path):
     recorder = start("record", output=tmp_path / "bag", duration=0.5, topics="[relative/name]")
     assert recorder.wait() == 0
@@ -233,6 +239,7 @@ def test_it_ends_by_itself(start, tmp_path):
         assert reader.message_count == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("parameters", "line"),
     [
@@ -253,6 +260,7 @@ def test_bad_input_is_one_line(start, parameters, line):
     assert len(recorder.lines) == 1
 
 
+@pytest.mark.slow
 def test_every_cut_of_a_recording_is_completed(tmp_path):
     """As a power cut leaves it: the file ends anywhere."""
     bag = Bag(tmp_path / "bag")

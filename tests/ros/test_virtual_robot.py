@@ -122,6 +122,7 @@ def test_a_command_timeout_can_be_set_while_it_moves(robot):
     robot.settles_at(0.0, 0.0)
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 def test_each_fault_can_be_switched_on_and_off_while_it_runs(robot):
     def seen(count: int = 60):
