@@ -49,7 +49,7 @@ test: $(VENV)/.installed-dev  ## Run all tests (ARGS="-m 'not slow'" for the qui
 	part() { echo "==> Testing $$1"; shift; $(BIN)/python -m pytest "$$@" $(ARGS) || [ $$? = 5 ]; }; \
 	part "what is not ROS" -n 2 --dist worksteal --ignore tests/ros && \
 	part "ROS 2 nodes, which mostly wait, side by side" tests/ros -n 4 --dist worksteal --realtime=without && \
-	part "what measures time, with nothing at work beside it" tests/ros --realtime=only
+	part "what measures time, two at a time and nothing else" tests/ros -n 2 --dist worksteal --realtime=only
 
 bench: $(VENV)/.installed-dev  ## Measure speed against bare PyBullet, rclpy and Stable-Baselines3
 	@echo "==> Measuring (all of it takes an hour and a half; ARGS=--collection and the like choose a part)"
