@@ -12,7 +12,7 @@ from optuna.trial import TrialState
 from physai import cli, study
 from physai.config import compose, conf_dir, validate
 from physai.errors import UserError
-from physai.plotting import plot_study
+from physai.plots.study import plot_study
 from physai.sweep import SweepReport
 from physai.training.config import TrainConfig
 from tests.malicious import Pickled

@@ -12,8 +12,8 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from sensor_msgs.msg import JointState
 
-from physai.ros import qos
-from physai.ros.joint_states import JointStates, Publishers
+from physai.ros.topics import qos
+from physai.ros.topics.joint_states import JointStates, Publishers
 from tests.ros.loop import Arm, closed_loop
 from tests.ros.peer import wait_for
 
