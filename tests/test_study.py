@@ -78,7 +78,7 @@ def test_time_to_target_is_the_first_evaluation_that_has_it(tmp_path):
 
 @pytest.mark.parametrize("override", ["objective.target=0.9", "objective.direction=minimize"])
 def test_a_search_in_the_wrong_direction_is_refused(override):
-    with pytest.raises(UserError, match="a target's time is to be minimized"):
+    with pytest.raises(UserError, match=r"^objective: a target's time is to be minimized"):
         validate(TrainConfig, compose("train", [override]))
 
 
