@@ -9,15 +9,6 @@ from physai.deploy import load_policy
 from physai.plots import drive
 
 
-@pytest.fixture
-def drawn(monkeypatch):
-    """The figures that were drawn, left open."""
-    monkeypatch.setattr(drive.plt, "close", lambda _: None)
-    yield lambda: drive.plt.gcf()
-    monkeypatch.undo()
-    drive.plt.close("all")
-
-
 def test_a_drive_shows_each_goal_in_the_colour_of_its_end_and_the_errors_over_time(exported_run, tmp_path, drawn):
     policy = load_policy(exported_run / "policy.pt")
     times = list(np.linspace(10.0, 14.0, 41))

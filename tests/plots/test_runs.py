@@ -8,15 +8,6 @@ from physai.plots import runs
 HEADER = "frame,return,length\n"
 
 
-@pytest.fixture
-def drawn(monkeypatch):
-    """The figures that were drawn, left open."""
-    monkeypatch.setattr(runs.plt, "close", lambda _: None)
-    yield lambda: runs.plt.gcf()
-    monkeypatch.undo()
-    runs.plt.close("all")
-
-
 def write(folder, rows):
     folder.mkdir()
     (folder / "episodes.csv").write_text(HEADER + rows)
