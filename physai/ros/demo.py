@@ -127,7 +127,7 @@ def _demo(node: DictConfig, _: Path) -> None:
     try:
         draw_drive(client.record, policy, output)
     except (OSError, ValueError) as error:
-        raise UserError(f"cannot write {output}: {error}") from None
+        raise UserError(f"cannot write {output}: {error}") from error
     kept = sum(result.kept for result in client.record.results)
     console.print(f"{kept} of {len(goals)} goals reached, and held for {config.hold:g} s. The path: {output}")
     if kept < len(goals):
