@@ -13,8 +13,8 @@ from torchrl.data.replay_buffers import RandomSampler
 from torchrl.objectives import DDPGLoss, TargetNetUpdater, TD3Loss
 from torchrl.objectives.utils import ValueEstimators
 
-from physai.algorithms.loss_optimizer import LossOptimizer, check_ranges
 from physai.algorithms.interface import Networks
+from physai.algorithms.loss_optimizer import LossOptimizer, check_ranges
 from physai.algorithms.proportional import ProportionalSampler
 from physai.config import Count, NonNegativeFloat, PositiveFloat
 from physai.errors import UserError

@@ -10,8 +10,8 @@ from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LRScheduler
 from torchrl.data import TensorDictReplayBuffer
 
-from physai.algorithms.loss_optimizer import LossOptimizer, check_ranges
 from physai.algorithms.interface import Networks
+from physai.algorithms.loss_optimizer import LossOptimizer, check_ranges
 from physai.config import Count, PositiveFloat
 from physai.errors import UserError
 
