@@ -25,7 +25,7 @@ def _check(node: DictConfig) -> None:
 
 
 def _plot(node: DictConfig, _: Path) -> None:
-    from physai.plotting import plot_runs
+    from physai.plots.runs import plot_runs
 
     config = validate(PlotConfig, node)
     runs = [Path(run) for run in config.runs]

@@ -12,7 +12,7 @@ from omegaconf import OmegaConf
 from physai import artifact, cli, foreign, train
 from physai.config import compose, conf_dir, validate
 from physai.errors import UserError
-from physai.plotting import plot_runs
+from physai.plots.runs import plot_runs
 from physai.training.config import TrainConfig
 from physai.training.run import TrainedPolicy, load_config, run_training
 from tests import malicious

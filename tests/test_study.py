@@ -12,7 +12,7 @@ from optuna.trial import TrialState
 from physai import cli, study
 from physai.config import compose, conf_dir, validate
 from physai.errors import UserError
-from physai.plotting import plot_study
+from physai.plots.study import plot_study
 from physai.sweep import SweepReport
 from physai.training.config import TrainConfig
 from tests.malicious import Pickled
@@ -78,7 +78,7 @@ def test_time_to_target_is_the_first_evaluation_that_has_it(tmp_path):
 
 @pytest.mark.parametrize("override", ["objective.target=0.9", "objective.direction=minimize"])
 def test_a_search_in_the_wrong_direction_is_refused(override):
-    with pytest.raises(UserError, match="a target's time is to be minimized"):
+    with pytest.raises(UserError, match=r"^objective: a target's time is to be minimized"):
         validate(TrainConfig, compose("train", [override]))
 
 

@@ -10,8 +10,8 @@ from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
-from physai.ros import qos
-from physai.ros.run import prepare_middleware
+from physai.ros.node.run import prepare_middleware
+from physai.ros.topics import qos
 
 
 def main() -> None:

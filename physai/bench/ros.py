@@ -24,10 +24,10 @@ from physai.bench.policy import make_run
 from physai.bench.timing import table
 from physai.deploy import read_metadata
 from physai.errors import UserError
-from physai.ros import qos
-from physai.ros.commands import controller_topic
-from physai.ros.processes import NodeProcess
-from physai.ros.run import prepare_middleware
+from physai.ros.driving.processes import NodeProcess
+from physai.ros.node.run import prepare_middleware
+from physai.ros.topics import qos
+from physai.ros.topics.commands import controller_topic
 from physai.signals import Quantity
 
 PERIOD_SECONDS = 60.0

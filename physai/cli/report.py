@@ -40,7 +40,7 @@ class SweepReport(Callback):
 
     def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:
         """Report on the runs below the sweep's folder."""
-        from physai.plotting import plot_runs
+        from physai.plots.runs import plot_runs
 
         folder = Path(config.hydra.sweep.dir)
         if study.searched(config) is not None:
@@ -74,7 +74,7 @@ class SweepReport(Callback):
 
 def _report_study(folder: Path) -> None:
     """Write ``study.csv`` and ``study.png``, and show the best trials; exit with code 1 if there are none."""
-    from physai.plotting import plot_study
+    from physai.plots.study import plot_study
 
     found = study.load(folder)
     names = study.short_names(key for trial in found.trials for key in trial.params)

@@ -9,10 +9,10 @@ import sys
 from typing import Any
 
 from physai.errors import UserError
-from physai.ros import outlet, signals
+from physai.ros.node import outlet, signals
 
 # Imported when they are asked for: the nodes need no gymnasium, and this package no ROS.
-_HOMES = {"RosPhysics": "physai.ros.physics", "RosReacherEnv": "physai.ros.gym_env"}
+_HOMES = {"RosPhysics": "physai.ros.bridge.physics", "RosReacherEnv": "physai.ros.bridge.gym_env"}
 
 
 _WITHOUT_ROS = "rclpy is not installed: pip install 'physai[ros]', or source ROS 2 Jazzy"

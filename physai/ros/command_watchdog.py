@@ -18,10 +18,10 @@ from std_msgs.msg import Empty, Float64MultiArray
 from std_srvs.srv import Trigger
 
 from physai.deploy.parameters import Parameters, parameter
-from physai.ros import qos
-from physai.ros.commands import JointCommands
-from physai.ros.parameters import declare
-from physai.ros.run import StoppableNode, run
+from physai.ros.node.parameters import declare
+from physai.ros.node.run import StoppableNode, run
+from physai.ros.topics import qos
+from physai.ros.topics.commands import JointCommands
 from physai.signals import Quantity
 
 

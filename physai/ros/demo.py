@@ -79,9 +79,9 @@ def _check(node: DictConfig) -> None:
 
 def _demo(node: DictConfig, _: Path) -> None:
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"  # no robot but ours shall hear of this
-    from physai.ros.goal_client import GoalClient
-    from physai.ros.picture import draw_drive
-    from physai.ros.processes import NodeProcess
+    from physai.plots.drive import draw_drive
+    from physai.ros.driving.goal_client import GoalClient
+    from physai.ros.driving.processes import NodeProcess
 
     config = validate(DemoConfig, node)
     path = config.path()

@@ -16,16 +16,17 @@ from physai.deploy import Command, Controller, ControllerConfig, Goal, Policy, S
 from physai.deploy.goals import GoalError, accept
 from physai.deploy.parameters import parameter
 from physai.errors import UserError
-from physai.ros import goals, outlet, qos
-from physai.ros.commands import JointCommands
-from physai.ros.diagnostics import Timing, diagnose
-from physai.ros.emergency_stop import TOPIC as EMERGENCY_STOP
-from physai.ros.emergency_stop import EmergencyStopTopic
-from physai.ros.estop_file import EmergencyStopFile
-from physai.ros.joint_states import JointStates
-from physai.ros.parameters import declare
-from physai.ros.run import StoppableNode, brief, run
-from physai.ros.watched_commands import WatchedCommands
+from physai.ros.node import outlet
+from physai.ros.node.estop_file import EmergencyStopFile
+from physai.ros.node.parameters import declare
+from physai.ros.node.run import StoppableNode, brief, run
+from physai.ros.topics import goals, qos
+from physai.ros.topics.commands import JointCommands
+from physai.ros.topics.diagnostics import Timing, diagnose
+from physai.ros.topics.emergency_stop import TOPIC as EMERGENCY_STOP
+from physai.ros.topics.emergency_stop import EmergencyStopTopic
+from physai.ros.topics.joint_states import JointStates
+from physai.ros.topics.watched_commands import WatchedCommands
 from physai.signals import Quantity
 
 # Nodes without our settings of Fast DDS may be found only by its second heartbeat: 2.9 s were measured. And when a

@@ -20,10 +20,10 @@ from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, Qo
 
 from physai.deploy.parameters import Parameters, parameter
 from physai.errors import UserError
-from physai.ros import commands, qos
-from physai.ros.bag import TYPES, Bag, recover
-from physai.ros.parameters import declare
-from physai.ros.run import StoppableNode, brief, run
+from physai.ros.node.parameters import declare
+from physai.ros.node.run import StoppableNode, brief, run
+from physai.ros.recording.bag import TYPES, Bag, recover
+from physai.ros.topics import commands, qos
 from physai.signals import Quantity
 
 TOPICS = (

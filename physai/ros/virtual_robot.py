@@ -13,12 +13,12 @@ from std_srvs.srv import Trigger
 from physai.deploy import JointState
 from physai.deploy.parameters import parameter
 from physai.errors import UserError
-from physai.ros import qos
-from physai.ros.commands import controller_topic
-from physai.ros.faults import FaultConfig, Faults
-from physai.ros.parameters import declare
-from physai.ros.run import StoppableNode, run
-from physai.ros.virtual_arm import GroupController, VirtualArm
+from physai.ros.node.parameters import declare
+from physai.ros.node.run import StoppableNode, run
+from physai.ros.topics import qos
+from physai.ros.topics.commands import controller_topic
+from physai.ros.virtual.arm import GroupController, VirtualArm
+from physai.ros.virtual.faults import FaultConfig, Faults
 
 
 @dataclass(frozen=True)

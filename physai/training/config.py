@@ -49,7 +49,7 @@ class ObjectiveConfig(Config):
     @model_validator(mode="after")
     def _direction_fits(self) -> "ObjectiveConfig":
         if (self.direction == "minimize") != (self.target is not None):
-            raise ValueError("a target's time is to be minimized, a success rate without target to be maximized")
+            raise ValueError(": a target's time is to be minimized, a success rate without target to be maximized")
         return self
 
 

@@ -87,7 +87,7 @@ def run_training(
         result = TrainedPolicy(run_dir, "best", config=config).evaluate(config.evaluation.episodes)
         summary = _summary(config, trainer, evaluation.best_frames, result)
         write_atomically(done, json.dumps(summary, indent=2).encode())
-        from physai.plotting import plot_runs  # no frame needs to wait for Matplotlib
+        from physai.plots.runs import plot_runs  # no frame needs to wait for Matplotlib
 
         try:
             plot_runs([run_dir], run_dir / "training.png")

@@ -18,8 +18,8 @@ from physai.evaluate import EvaluateConfig
 from physai.export import ExportConfig
 from physai.play import PlayConfig
 from physai.plot import PlotConfig
-from physai.ros.commands import controller_topic
 from physai.ros.demo import DemoConfig
+from physai.ros.topics.commands import controller_topic
 from physai.signals import Quantity
 from physai.training.config import TrainConfig
 from tests.docs.blocks import ROOT, hooks

@@ -12,7 +12,7 @@ from _pytest.runner import runtestprotocol
 
 os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"  # before anything of ROS starts
 
-from physai.ros.run import prepare_middleware
+from physai.ros.node.run import prepare_middleware
 
 prepare_middleware()
 

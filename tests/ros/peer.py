@@ -28,8 +28,8 @@ from std_msgs.msg import Bool, Float64MultiArray, String
 from std_srvs.srv import SetBool, Trigger
 
 from physai.processes import die_with
-from physai.ros import qos
-from physai.ros.commands import controller_topic
+from physai.ros.topics import qos
+from physai.ros.topics.commands import controller_topic
 from physai.signals import Quantity
 
 SHM = Path("/dev/shm")

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from physai.deploy import load_policy
-from physai.ros.diagnostics import Timing
+from physai.ros.topics.diagnostics import Timing
 from tests.ros.loop import closed_loop
 from tests.ros.peer import wait_for
 

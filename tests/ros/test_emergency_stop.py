@@ -6,8 +6,8 @@ import pytest
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from std_msgs.msg import Bool, String
 
-from physai.ros import qos
-from physai.ros.emergency_stop import EmergencyStopTopic
+from physai.ros.topics import qos
+from physai.ros.topics.emergency_stop import EmergencyStopTopic
 from tests.ros.loop import FAR, closed_loop
 from tests.ros.peer import Peer, wait_for
 

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from physai.ros import estop_file
-from physai.ros.estop_file import EmergencyStopFile
+from physai.ros.node import estop_file
+from physai.ros.node.estop_file import EmergencyStopFile
 from tests.ros.loop import FAR, closed_loop
 from tests.ros.peer import wait_for
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from physai.deploy import JointState
 from physai.errors import UserError
-from physai.ros.faults import FaultConfig, Faults
+from physai.ros.virtual.faults import FaultConfig, Faults
 
 NAMES = ["a", "b", "c"]
 

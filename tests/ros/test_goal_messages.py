@@ -6,7 +6,7 @@ from geometry_msgs.msg import PointStamped
 from sensor_msgs.msg import JointState
 
 from physai.errors import UserError
-from physai.ros import goals
+from physai.ros.topics import goals
 from physai.signals import Quantity, Signal
 
 PLACE = Signal("goal", Quantity.POSITION, (3,), labels=("x", "y", "z"), frame="base")

@@ -26,7 +26,7 @@ WITHIN = 0.15  # s
 
 TALKER = """
 import sys, time
-from physai.ros import outlet
+from physai.ros.node import outlet
 with outlet.outlets():
     longest = 0.0
     for number in range({lines}):

@@ -109,6 +109,14 @@ def test_the_wheel_has_the_files_of_ros_once(wheel):
     assert not [name for name in names if name.startswith("physai/ros/package")]
 
 
+def test_the_wheel_has_no_benchmarks_and_no_need_of_them(wheel):
+    archive = zipfile.ZipFile(wheel)
+    names = archive.namelist()
+    assert "physai/__init__.py" in names
+    assert not [name for name in names if name.startswith("physai/bench")]
+    assert not [name for name in names if name.endswith(".py") and b"physai.bench" in archive.read(name)]
+
+
 def test_ros_finds_an_installed_wheel(venv):
     found = subprocess.run(
         [
@@ -263,7 +271,7 @@ def test_package_xml_names_every_package_of_ros_that_is_imported():
     root = ElementTree.parse(PACKAGE / "package.xml").getroot()
     named = {element.text for element in root.iter("exec_depend")}
     imported = set()
-    for file in [*(REPOSITORY / "physai" / "ros").glob("*.py"), *(PACKAGE / "launch").glob("*.py")]:
+    for file in (REPOSITORY / "physai" / "ros").rglob("*.py"):  # launch files, too
         for node in ast.walk(ast.parse(file.read_text())):
             names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
             names += [node.module] if isinstance(node, ast.ImportFrom) and node.module else []

@@ -18,7 +18,7 @@ from physai.deploy.parameters import Parameters, parameter
 from physai.errors import UserError
 from physai.ros.command_watchdog import WatchdogConfig
 from physai.ros.inference_node import InferenceConfig
-from physai.ros.parameters import declare, describe, help_text
+from physai.ros.node.parameters import declare, describe, help_text
 from physai.ros.virtual_robot import VirtualRobotConfig
 from tests.ros.peer import free_domain
 

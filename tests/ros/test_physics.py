@@ -15,7 +15,7 @@ from physai.errors import UserError
 from physai.physics import RobotState, nominal_dynamics
 from physai.robots import RobotSpec
 from physai.ros import RosPhysics
-from physai.ros.robot_link import RobotError
+from physai.ros.bridge.robot_link import RobotError
 from tests.ros.peer import TOPIC, wait_for
 
 DT = 0.02

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from std_msgs.msg import Float64MultiArray
 
-from physai.ros.commands import controller_topic
+from physai.ros.topics.commands import controller_topic
 from physai.signals import Quantity
 from tests.ros.forge import forged
 from tests.ros.peer import Peer, wait_for

@@ -18,7 +18,7 @@ from std_msgs.msg import Bool, Float64MultiArray, String, UInt64
 from stereo_msgs.msg import DisparityImage
 
 from physai.errors import UserError
-from physai.ros.bag import TYPES, Bag, recover
+from physai.ros.recording.bag import TYPES, Bag, recover
 from tests.ros.peer import wait_for
 
 KINDS = {

@@ -7,7 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 
 from physai.errors import UserError
-from physai.ros.robot_link import RobotLink
+from physai.ros.bridge.robot_link import RobotLink
 from tests.ros.forge import forged
 from tests.ros.loop import closed_loop
 from tests.ros.peer import wait_for

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from physai.errors import UserError
-from physai.ros.virtual_arm import GroupController, VirtualArm
+from physai.ros.virtual.arm import GroupController, VirtualArm
 from physai.signals import Quantity
 
 

@@ -164,7 +164,8 @@ def test_joints_are_commanded_and_shown_in_the_order_that_is_asked_for(other):
 
 @pytest.mark.slow
 def test_the_inference_node_lives_with_faults_that_leave_enough_and_stops_for_the_others(start, peer, policy_path):
-    start("virtual_robot", joints="[joint2, joint1]", state_joints="[joint2, lid, joint1]", randomization="strong")
+    # No other joint in the states: a NaN there would spoil nothing, and five good states in a row end a hold.
+    start("virtual_robot", joints="[joint2, joint1]", state_joints="[joint2, joint1]", randomization="strong")
     start("inference_node", policy_path=policy_path, autostart=True, joints="[joint2, joint1]", goal=list(FAR))
     peer.moved()
     for fault, value in [("reorder", True), ("nan", 0.3), ("drop", 0.3), ("noise", 0.002)]:

@@ -17,9 +17,9 @@ from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 
 from physai.errors import UserError
-from physai.ros import qos
-from physai.ros.commands import JointCommands
-from physai.ros.run import brief, prepare_middleware
+from physai.ros.node.run import brief, prepare_middleware
+from physai.ros.topics import qos
+from physai.ros.topics.commands import JointCommands
 from physai.signals import Quantity
 
 _DISCOVERY = 3.0  # s until all rivals are known, those without our settings of Fast DDS, too; 2.9 were measured

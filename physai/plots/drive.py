@@ -1,6 +1,7 @@
-"""A picture of where an arm went."""
+"""Pictures of drives: where an arm went; no ROS in here."""
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import matplotlib
 import numpy as np
@@ -11,7 +12,6 @@ from physai.config import validate
 from physai.deploy import Policy
 from physai.envs.simulation import EnvConfig
 from physai.robots import ForwardKinematics, RobotSpec
-from physai.ros.goal_client import Record
 from physai.signals import Quantity, Ring
 
 matplotlib.use("Agg")
@@ -21,8 +21,11 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.patches import Annulus, Circle
 
+if TYPE_CHECKING:
+    from physai.ros.driving.goal_client import Record
 
-def draw_drive(record: Record, policy: Policy, output: Path) -> None:
+
+def draw_drive(record: "Record", policy: Policy, output: Path) -> None:
     """Draw the end effector's path from above, with goals that are places (left), and its errors over time (right).
 
     Args:
@@ -37,7 +40,7 @@ def draw_drive(record: Record, policy: Policy, output: Path) -> None:
     plt.close(figure)
 
 
-def _draw_path(figure: Figure, axes: Axes, record: Record, policy: Policy) -> None:
+def _draw_path(figure: Figure, axes: Axes, record: "Record", policy: Policy) -> None:
     metadata, started = policy.metadata, record.results[0].sent
     config = validate(EnvConfig, DictConfig(metadata.raw["config"]["env"]))
     kinematics = ForwardKinematics(RobotSpec.from_config(config.robot))
@@ -65,7 +68,7 @@ def _draw_path(figure: Figure, axes: Axes, record: Record, policy: Policy) -> No
     figure.colorbar(path, ax=axes, label="time (s)", shrink=0.8)
 
 
-def _draw_errors(axes: Axes, record: Record, policy: Policy) -> None:
+def _draw_errors(axes: Axes, record: "Record", policy: Policy) -> None:
     tolerances, times, started = policy.metadata.tolerances, np.array(record.times), record.results[0].sent
     scale = np.array([tolerance.value for tolerance in tolerances])
     ends = [result.sent for result in record.results[1:]] + [times[-1]]

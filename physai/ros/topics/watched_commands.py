@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from rclpy.node import Node
 from std_msgs.msg import Empty
 
-from physai.ros import qos
-from physai.ros.commands import JointCommands
+from physai.ros.topics import qos
+from physai.ros.topics.commands import JointCommands
 from physai.signals import Quantity
 
 

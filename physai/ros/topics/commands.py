@@ -9,8 +9,8 @@ from rclpy.duration import Duration
 from rclpy.node import Node
 from std_msgs.msg import Float64MultiArray
 
-from physai.ros import qos
-from physai.ros.companions import Companions
+from physai.ros.topics import qos
+from physai.ros.topics.companions import Companions
 from physai.signals import Quantity
 
 _LAST, _PERIOD = 5, 0.02  # s

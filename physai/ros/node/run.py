@@ -20,9 +20,9 @@ from rclpy.utilities import remove_ros_args
 
 from physai.deploy.parameters import Parameters
 from physai.errors import UserError
-from physai.ros import signals
-from physai.ros.outlet import outlets
-from physai.ros.parameters import help_text
+from physai.ros.node import signals
+from physai.ros.node.outlet import outlets
+from physai.ros.node.parameters import help_text
 
 # Jazzy's Fast DDS (2.14) reads the first, later ones the second.
 _PROFILES = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")

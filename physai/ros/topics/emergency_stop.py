@@ -9,7 +9,7 @@ from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 from rclpy.subscription import Subscription
 from std_msgs.msg import Bool
 
-from physai.ros import qos
+from physai.ros.topics import qos
 
 TOPIC = "/emergency_stop"
 _AGAIN = 0.5  # s until all latched publishers have surely told again what they said last

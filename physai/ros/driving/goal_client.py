@@ -15,10 +15,10 @@ from std_msgs.msg import String
 
 from physai.deploy import Policy, State
 from physai.errors import UserError
-from physai.ros import goals, qos
-from physai.ros.commands import controller_topic
-from physai.ros.processes import NodeProcess
-from physai.ros.run import prepare_middleware
+from physai.ros.driving.processes import NodeProcess
+from physai.ros.node.run import prepare_middleware
+from physai.ros.topics import goals, qos
+from physai.ros.topics.commands import controller_topic
 from physai.signals import Tolerance
 
 _LOOK = 1.0  # s for others to be discovered

@@ -8,7 +8,7 @@ from rclpy.node import Node
 from sensor_msgs.msg import JointState as JointStateMessage
 
 from physai.deploy import JointState
-from physai.ros import qos
+from physai.ros.topics import qos
 
 TOPIC = "/joint_states"
 # Numbers of lost messages are skipped, at most so many and so many a second; farther on counts somebody else.

@@ -13,7 +13,7 @@ from physai.config import PositiveFloat
 from physai.errors import UserError
 from physai.physics import DynamicsParameters, RobotState
 from physai.robots import RobotSpec
-from physai.ros.robot_link import RobotError, RobotLink
+from physai.ros.bridge.robot_link import RobotError, RobotLink
 from physai.signals import Quantity
 
 _HOME = 0.02  # rad; a joint this near to where it shall start is there

@@ -1,0 +1,1 @@
+"""Recordings as files; no ROS in here."""

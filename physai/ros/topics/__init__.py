@@ -1,0 +1,1 @@
+"""What nodes say and hear: qualities of service, commands, joint states, goals, emergency stops, diagnostics."""

@@ -1,0 +1,1 @@
+"""What the virtual robot is made of: its arm, and its faults; no ROS in here."""
