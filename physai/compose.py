@@ -13,6 +13,8 @@ from hydra import initialize_config_dir
 from hydra.core.config_loader import ConfigLoader
 from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override
 from hydra.core.plugins import Plugins
 from hydra.errors import HydraException, MissingConfigException, OverrideParseException
 from hydra.plugins.config_source import ConfigLoadError
@@ -106,6 +108,18 @@ def initialized(name: str) -> Iterator[ConfigLoader]:
             yield state.config_loader()
     finally:
         state.hydra = running
+
+
+def parse(overrides: Iterable[str]) -> list[Override]:
+    """Read overrides.
+
+    Raises:
+        UserError: If one is none.
+    """
+    try:
+        return OverridesParser.create().parse_overrides(list(overrides))
+    except OverrideParseException as error:
+        raise UserError(f"'{error.override}' is not an override such as key=value") from None
 
 
 def compose(name: str, overrides: Iterable[str] = (), hydra: bool = False) -> DictConfig:

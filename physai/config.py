@@ -32,6 +32,7 @@ NonNegativeFloat = Annotated[float, Field(ge=0)]
 
 C = TypeVar("C", bound=Config)
 
+
 def validate(model: type[C], node: DictConfig) -> C:
     """Turn a composed config into its typed model.
 

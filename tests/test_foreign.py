@@ -10,7 +10,8 @@ import pytest
 from omegaconf import OmegaConf
 
 from physai import artifact, cli, foreign, train
-from physai.config import compose, conf_dir, validate
+from physai.compose import compose, conf_dir
+from physai.config import validate
 from physai.errors import UserError
 from physai.plots.runs import plot_runs
 from physai.training.config import TrainConfig

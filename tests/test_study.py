@@ -8,12 +8,13 @@ import optuna
 import pytest
 from omegaconf import OmegaConf
 from optuna.trial import TrialState
+from physai.sweep import SweepReport
 
 from physai import cli, study
-from physai.config import compose, conf_dir, validate
+from physai.compose import compose, conf_dir
+from physai.config import validate
 from physai.errors import UserError
 from physai.plots.study import plot_study
-from physai.sweep import SweepReport
 from physai.training.config import TrainConfig
 from tests.malicious import Pickled
 

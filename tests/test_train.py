@@ -7,7 +7,7 @@ import sys
 import pytest
 
 from physai import cli, train
-from physai.config import compose
+from physai.compose import compose
 from physai.errors import UserError
 from physai.training.agent import Agent
 from tests.training.small import SMALL

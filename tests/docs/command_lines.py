@@ -12,7 +12,8 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, OmegaConf
 
 from physai.bench.__main__ import _options
-from physai.config import compose, validate
+from physai.compose import compose
+from physai.config import validate
 from physai.envs.simulation import EnvConfig
 from physai.evaluate import EvaluateConfig
 from physai.export import ExportConfig

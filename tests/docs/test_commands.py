@@ -6,7 +6,8 @@ import shutil
 import pytest
 import yaml
 
-from physai.config import compose, conf_dir, validate
+from physai.compose import compose, conf_dir
+from physai.config import validate
 from physai.deploy import State
 from physai.errors import UserError
 from physai.export import export

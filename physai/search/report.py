@@ -1,0 +1,102 @@
+"""What a search shows: how far it is, a line for each trial, and in the end the best of them."""
+
+import shlex
+import sys
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import pandas
+from rich.console import Console
+from rich.markup import escape
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+from physai.search.space import overrides
+from physai.search.study import Study
+
+_BEST = 10
+
+
+class Report:
+    """A progress bar on a terminal, and a line for each trial that has ended; a context.
+
+    Args:
+        folder: The study's.
+        study: It.
+        trials: How many there will be.
+    """
+
+    def __init__(self, folder: Path, study: Study, trials: int) -> None:
+        self._folder, self._study = folder, study
+        self._objective = "seconds to target" if study.minimize else "success rate"
+        self._names = _short_names(study.space)
+        self._progress = Progress(
+            TextColumn("searching"), BarColumn(), MofNCompleteColumn(), TextColumn("trials"), TimeElapsedColumn(),
+            disable=not sys.stdout.isatty(),
+        )  # fmt: skip
+        self._task = self._progress.add_task("", total=trials, completed=len(study.done()))
+
+    def __enter__(self) -> "Report":
+        self._progress.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._progress.stop()
+
+    def ended(self, run: int) -> None:
+        """Show what became of a run."""
+        trial = self._study.trials()[run]
+        result = trial.user_attrs.get("error") or ("pruned" if trial.state.name == "PRUNED" else None)
+        result = f"failed: {result}" if trial.state.name == "FAIL" else result or f"{self._objective} {trial.value:.3g}"
+        values = " ".join(f"{self._names[key]}={_short(value)}" for key, value in trial.params.items())
+        self._progress.update(self._task, completed=len(self._study.done()))
+        line = f"[{run}] {result}  ({values})"
+        print("".join(one if one.isprintable() else "?" for one in line), flush=True)
+
+    def summary(self, fixed: Sequence[str]) -> None:
+        """Write ``study.csv`` and ``study.png``, and show the best trials; exit with code 1 if there are none.
+
+        Args:
+            fixed: Overrides of all trials.
+        """
+        from physai.plots.study import plot_study
+
+        trials = self._study.trials()
+        rows = [
+            {"run": run, "state": trial.state.name.lower(),
+             self._objective: trial.value if trial.state.name == "COMPLETE" else None, **trial.params}
+            for run, trial in sorted(trials.items())
+        ]  # fmt: skip
+        table = pandas.DataFrame(rows)
+        table.to_csv(self._folder / "study.csv", index=False)
+        best = table[table["state"] == "complete"].sort_values(self._objective, ascending=self._study.minimize)
+        if best.empty:
+            print(f"error: none of {len(rows)} trials came to an end; output.txt of each says why", file=sys.stderr)
+            sys.exit(1)
+        self._show(best, len(rows))
+        plot_study(table, self._objective, self._study.minimize, self._names, self._folder / "study.png")
+        print(f"All trials: {self._folder / 'study.csv'}, {self._folder / 'study.png'}. Train with the best values:")
+        values = trials[int(best["run"].iloc[0])].params
+        print("  python -m physai.train " + shlex.join([*fixed, *overrides(values)]))
+
+    def _show(self, best: pandas.DataFrame, count: int) -> None:
+        title = f"{self._folder}: the best of {count} trials"
+        table = Table(title=escape(title), title_justify="left")
+        for column in ("run", self._objective, *self._names.values()):
+            table.add_column(escape(column), justify="left" if column == "run" else "right")
+        for row in best.head(_BEST).to_dict("records"):
+            values = (row[self._objective], *(row[key] for key in self._names))
+            table.add_row(str(row["run"]), *(escape(_short(value)) for value in values))
+        Console().print(table)
+
+
+def _short_names(keys: Iterable[str]) -> dict[str, str]:
+    """The last word of each key, or all of it where two have the same."""
+    keys = sorted(keys)
+    last = [key.rpartition(".")[2] for key in keys]
+    return {key: name if last.count(name) == 1 else key for key, name in zip(keys, last, strict=True)}
+
+
+def _short(value: Any) -> str:
+    return f"{value:.3g}" if isinstance(value, float) else str(value)

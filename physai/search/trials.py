@@ -1,0 +1,118 @@
+"""Trials: ordinary training runs, each in a process of its own that has imported everything already."""
+
+import contextlib
+import csv
+import fcntl
+import json
+import math
+import multiprocessing
+import os
+import shutil
+import signal
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+from physai.processes import end_with
+
+OUTPUT = "output.txt"
+
+_CONTEXT = multiprocessing.get_context("forkserver")
+_CONTEXT.set_forkserver_preload(["physai.training.run"])
+
+
+class Evaluation(NamedTuple):
+    """An evaluation while a run trains."""
+
+    frames: int
+    seconds: float
+    success_rate: float
+
+
+class TrialProcess:
+    """A training run that has been started, or goes on from its last checkpoint.
+
+    Args:
+        folder: The run's.
+        overrides: Its config.
+
+    Attributes:
+        sentinel: Ready when it has ended.
+    """
+
+    def __init__(self, folder: Path, overrides: Sequence[str]) -> None:
+        self.folder = folder
+        self._process = _CONTEXT.Process(target=_run, args=(os.getpid(), Path.cwd(), folder, list(overrides)))
+        self._process.start()
+        self.sentinel = self._process.sentinel
+
+    @property
+    def ended(self) -> bool:
+        """Whether it has."""
+        return not self._process.is_alive()
+
+    def stop(self) -> None:
+        """Ask it to save itself and end."""
+        self._process.terminate()
+
+    def join(self, seconds: float) -> None:
+        """Wait until it has ended; kill it if it takes longer."""
+        self._process.join(seconds)
+        if not self.ended:
+            self._process.kill()
+
+    def error(self) -> str:
+        """The last line that it printed, or what it died of."""
+        code = self._process.exitcode or 0
+        if code < 0:
+            return f"killed by {signal.Signals(-code).name}"
+        lines = (self.folder / OUTPUT).read_text(errors="replace").split("\n") if self.folder.is_dir() else []
+        return next((line.removeprefix("error: ") for line in reversed(lines) if line.strip()), f"exit code {code}")
+
+
+def evaluations(folder: Path) -> list[Evaluation]:
+    """Read the evaluations of a run so far."""
+    try:
+        lines = (folder / "metrics.csv").read_text().splitlines(keepends=True)
+    except FileNotFoundError:
+        return []
+    rows = csv.DictReader(line for line in lines if line.endswith("\n"))  # the last is perhaps being written
+    keys = ("frames", "time/seconds", "evaluation/success_rate")
+    return [Evaluation(int(row[keys[0]]), float(row[keys[1]]), float(row[keys[2]])) for row in rows if row[keys[2]]]
+
+
+def success_rate(folder: Path) -> float | None:
+    """The success rate of the final evaluation; None if the run did not come to its end."""
+    path = folder / "summary.json"
+    return float(json.loads(path.read_text())["success_rate"]) if path.is_file() else None
+
+
+def time_to_target(folder: Path, target: float) -> float:
+    """Seconds of training until an evaluation first had a success rate; infinity if none has."""
+    return next((one.seconds for one in evaluations(folder) if one.success_rate >= target), math.inf)
+
+
+def _run(starter: int, home: Path, folder: Path, overrides: list[str]) -> None:
+    """Be the process of a run."""
+    os.setsid()  # Ctrl-C is for the search, which ends its trials
+    end_with(starter)
+    os.chdir(home)
+    folder.mkdir(exist_ok=True)
+    fcntl.flock(os.open(folder, os.O_RDONLY), fcntl.LOCK_EX)  # a killed search's process of this run may still save it
+    checkpoints = any((folder / "checkpoints").glob("*.pt"))
+    if not checkpoints:
+        for path in folder.iterdir():
+            shutil.rmtree(path) if path.is_dir() and not path.is_symlink() else path.unlink()
+    output = os.open(folder / OUTPUT, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o666)
+    for stream in (sys.stdout, sys.stderr):
+        with contextlib.suppress(AttributeError, ValueError):
+            stream.reconfigure(line_buffering=True)  # type: ignore[union-attr]
+    os.dup2(output, 1)
+    os.dup2(output, 2)
+    where = f"resume='{folder}'" if checkpoints else f"hydra.run.dir='{folder}'"
+    sys.argv = ["physai.train", *overrides, where]
+
+    from physai import train
+
+    train.main()
