@@ -92,17 +92,17 @@ class guard:  # noqa: N801
         for number, handler in self._before.items():
             signal.signal(number, handler)
         if isinstance(error, UserError):
-            print(f"error: {_printable(str(error))}", file=sys.stderr)
+            print(f"error: {printable(str(error))}", file=sys.stderr)
             sys.exit(2)
         if isinstance(error, OSError):
             where = str(error.filename or "the disk")
-            print(f"error: {_printable(f'{where}: {error.strerror or error}')}", file=sys.stderr)
+            print(f"error: {printable(f'{where}: {error.strerror or error}')}", file=sys.stderr)
             sys.exit(2)
         if isinstance(error, KeyboardInterrupt):
             sys.exit(130)
 
 
-def _printable(text: str) -> str:
+def printable(text: str) -> str:
     """Text as one line that a terminal shows and does not obey; names in it may be from a file of anyone's."""
     return "".join(one if one.isprintable() else one.encode("unicode_escape").decode() for one in text)
 

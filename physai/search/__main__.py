@@ -1,8 +1,8 @@
 """``python -m physai.search``: look for better values for training (see ``--help``)."""
 
+import re
 import sys
 from importlib.util import find_spec
-from multiprocessing.connection import wait
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -10,17 +10,11 @@ from omegaconf import DictConfig
 
 from physai import cli
 from physai.compose import compose, parse
+from physai.config import validate
 from physai.errors import UserError
 
 if TYPE_CHECKING:
-    from optuna import Trial
-
-    from physai.search.config import SearchConfig, StudyConfig
-    from physai.search.report import Report
-    from physai.search.study import Study
-    from physai.search.trials import TrialProcess
-
-_POLL = 0.5  # s
+    from physai.search.config import SearchConfig
 
 
 def main() -> None:
@@ -30,6 +24,12 @@ def main() -> None:
             raise UserError("a search takes ranges as they are, without -m")
         search = Search(cli.overrides())
     cli.main("search", search.run, search.check, search.common)
+
+
+def _config(node: DictConfig) -> "SearchConfig":
+    from physai.search.config import SearchConfig
+
+    return validate(SearchConfig, node)
 
 
 class Search:
@@ -42,9 +42,9 @@ class Search:
     def __init__(self, given: list[str]) -> None:
         self._given = given
         parsed = [one for one in parse(given) if not one.is_sweep_override()]
-        own = ("hydra", "search")
         self.common = [str(one.input_line) for one in parsed]
-        self._fixed = [str(one.input_line) for one in parsed if not one.key_or_group.lstrip("+~").startswith(own)]
+        own = ("hydra", "search")  # what is not for the trials
+        self._fixed = [str(one.input_line) for one in parsed if re.split("[./]", one.key_or_group)[0] not in own]
 
     def check(self, node: DictConfig) -> None:
         """See that every choice and both ends of every range make a run."""
@@ -64,6 +64,7 @@ class Search:
     def run(self, node: DictConfig, folder: Path) -> None:
         """Search, and report."""
         from physai.search import space
+        from physai.search.loop import run_trials
         from physai.search.report import Report
         from physai.search.study import Study
 
@@ -80,35 +81,12 @@ class Search:
         try:
             if done := len(study.done()):
                 print(f"{folder}: {done} trials are done, {max(0, settings.trials - done)} are left.", flush=True)
-            report = Report(folder, study, settings.trials)
-            with report:
-                _Trials(folder, study, report, config, self._fixed).run()
+            with Report(folder, study, settings.trials) as report:
+                run_trials(folder, study, config, self._fixed, report.ended)
             report.summary(self._fixed)
         finally:
             study.close()
 
 
-class _Trials:
-    """Runs the trials that are left, some at a time."""
-
-    def __init__(
-        self, folder: Path, study: "Study", report: "Report", config: "SearchConfig", fixed: list[str]
-    ) -> None:
-        self._folder, self._study, self._report, self._fixed = folder, study, report, fixed
-        self._settings: StudyConfig = config.search
-        self._every_frames = config.evaluation.every_frames
-        self._running: dict[int, tuple[Trial, TrialProcess]] = {}
-        self._pruned: set[int] = set()
-        self._steps: dict[int, int] = {}
-
-    def run(self) -> None:
-        try:
-            while self._start() or self._running:
-                wait([process.sentinel for _, process in self._running.values()], _POLL)
-                for run in list(self._running):
-                    self._look(run)
-        finally:
-            for _, process in self._running.values():
-                process.stop()
-            for _, process in self._running.values():
-                process.join(20)
+if __name__ == "__main__":
+    main()

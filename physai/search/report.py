@@ -12,6 +12,7 @@ from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
+from physai import cli
 from physai.search.space import overrides
 from physai.search.study import Study
 
@@ -47,12 +48,14 @@ class Report:
     def ended(self, run: int) -> None:
         """Show what became of a run."""
         trial = self._study.trials()[run]
-        result = trial.user_attrs.get("error") or ("pruned" if trial.state.name == "PRUNED" else None)
-        result = f"failed: {result}" if trial.state.name == "FAIL" else result or f"{self._objective} {trial.value:.3g}"
+        result = {
+            "COMPLETE": f"{self._objective} {_short(trial.value)}",
+            "PRUNED": "pruned",
+            "FAIL": f"failed: {trial.user_attrs.get('error')}",
+        }[trial.state.name]
         values = " ".join(f"{self._names[key]}={_short(value)}" for key, value in trial.params.items())
         self._progress.update(self._task, completed=len(self._study.done()))
-        line = f"[{run}] {result}  ({values})"
-        print("".join(one if one.isprintable() else "?" for one in line), flush=True)
+        print(cli.printable(f"[{run}] {result}  ({values})"), flush=True)
 
     def summary(self, fixed: Sequence[str]) -> None:
         """Write ``study.csv`` and ``study.png``, and show the best trials; exit with code 1 if there are none.

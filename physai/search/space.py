@@ -50,7 +50,8 @@ def make_space(ranges: Mapping[str, str]) -> Space:
 
 def _distribution(override: Override) -> BaseDistribution:
     if override.is_choice_sweep():
-        return CategoricalDistribution(list(override.sweep_iterator(_choice)))
+        choices: Any = list(override.sweep_iterator(_choice))
+        return CategoricalDistribution(choices)
     sweep: Any = override.value()
     if not isinstance(sweep, RangeSweep | IntervalSweep):
         raise ValueError("a range is needed, such as interval(0.1,0.4) or choice(1,2,4)")

@@ -19,6 +19,7 @@ from optuna.pruners import MedianPruner
 from optuna.samplers import TPESampler
 from optuna.storages import JournalStorage
 from optuna.storages.journal import JournalFileBackend
+from optuna.study import StudyDirection
 from optuna.trial import FrozenTrial, Trial, TrialState
 
 from physai.errors import UserError
@@ -122,7 +123,7 @@ def _create(path: Path, about: dict[str, Any], minimize: bool) -> None:
         raise UserError(f"{path.parent} holds no study, but {min(others)}: choose another hydra.run.dir")
     for left in path.parent.iterdir():
         left.unlink()
-    direction = "minimize" if minimize else "maximize"
+    direction = StudyDirection.MINIMIZE if minimize else StudyDirection.MAXIMIZE
     study = optuna.create_study(study_name=_NAME, storage=_storage(temporary), direction=direction)
     study.set_user_attr("about", about)
     os.replace(temporary, path)
@@ -159,5 +160,3 @@ def _repair(path: Path) -> None:
     content = path.read_bytes()
     if not content.endswith(b"\n"):
         os.truncate(path, content.rfind(b"\n") + 1)
-
-

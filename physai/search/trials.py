@@ -1,6 +1,5 @@
 """Trials: ordinary training runs, each in a process of its own that has imported everything already."""
 
-import contextlib
 import csv
 import fcntl
 import json
@@ -105,9 +104,6 @@ def _run(starter: int, home: Path, folder: Path, overrides: list[str]) -> None:
         for path in folder.iterdir():
             shutil.rmtree(path) if path.is_dir() and not path.is_symlink() else path.unlink()
     output = os.open(folder / OUTPUT, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o666)
-    for stream in (sys.stdout, sys.stderr):
-        with contextlib.suppress(AttributeError, ValueError):
-            stream.reconfigure(line_buffering=True)  # type: ignore[union-attr]
     os.dup2(output, 1)
     os.dup2(output, 2)
     where = f"resume='{folder}'" if checkpoints else f"hydra.run.dir='{folder}'"
