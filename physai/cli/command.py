@@ -65,11 +65,15 @@ def _run(name: str, job: Job, config: DictConfig) -> None:
     """Run one job, like Hydra's main, but with the config that was checked: Hydra would compose it twice more."""
     with read_write(config.hydra):
         config.hydra.mode = RunMode.RUN
+
+    def run(node: DictConfig) -> None:
+        with guard():  # within Hydra, which would say more about an error
+            job(node, _begin(node))
+
     callbacks = Callbacks(config)
     with initialized(name) as loader:
         callbacks.on_run_start(config=config, config_name=name)
-        context = HydraContext(loader, callbacks)
-        returned = run_job(lambda node: job(node, _begin(node)), config, "hydra.run.dir", None, context)
+        returned = run_job(run, config, "hydra.run.dir", None, HydraContext(loader, callbacks))
         callbacks.on_run_end(config=config, config_name=name, job_return=returned)
     returned.return_value  # noqa: B018  # raises what the job has raised
 
