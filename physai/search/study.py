@@ -52,14 +52,17 @@ class Study:
         self._folder = os.open(folder, os.O_RDONLY)
         try:
             fcntl.flock(self._folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise UserError(f"{folder}: another search is at work there") from None
-        path = folder / _FILE
-        if not path.exists():
-            _create(path, about, minimize)
-        self._study = _load(path, about, space)
-        _repair(path)
-        self._go_on()
+            path = folder / _FILE
+            if not path.exists():
+                _create(path, about, minimize)
+            self._study = _load(path, about, space)
+            _repair(path)
+            self._go_on()
+        except BaseException as error:
+            self.close()
+            if isinstance(error, BlockingIOError):
+                raise UserError(f"{folder}: another search is at work there") from None
+            raise
 
     def close(self) -> None:
         """Let others work on it."""

@@ -67,7 +67,7 @@ def summaries(folder):
 
 def test_a_search_with_two_trials_at_a_time_survives_one_that_fails_and_can_be_made_longer(run, tmp_path):
     # a rate of 5e38 passes every check and explodes at the first update
-    arguments = ("algo.optimizer.lr=choice(1e-3,5e38)", "seed=1", "search.jobs=2")
+    arguments = ("algo.optimizer.lr=choice(1e-3,5e38)", "seed=4", "search.jobs=2")
     code, output, error = run(*arguments, "search.trials=3")
     assert code == 0, output + error
     folder = tmp_path / "search"
@@ -93,7 +93,7 @@ def test_a_search_with_two_trials_at_a_time_survives_one_that_fails_and_can_be_m
     assert (code, len(table(folder))) == (0, 4), output + error
     assert "3 trials are done, 1 are left" in output
     assert {number: summaries(folder)[number] for number in finished} == finished
-    code, _, error = run("algo.optimizer.lr=choice(1e-3,2e-3)", "seed=1")
+    code, _, error = run("algo.optimizer.lr=choice(1e-3,2e-3)", "seed=4")
     assert (code, error) == (2, "error: search holds a study of something else: choose another hydra.run.dir\n")
 
 

@@ -47,8 +47,8 @@ def test_what_the_command_line_says_goes_before_the_ready_ranges():
         ("choice(128,512)", CategoricalDistribution([128, 512])),
         ("0.9,0.99", CategoricalDistribution([0.9, 0.99])),
         (
-            "choice([64,64],[128],null,true,'a b')",
-            CategoricalDistribution(["[64,64]", "[128]", "null", "True", "'a b'"]),
+            "choice([64,64],[128],true,'a b')",
+            CategoricalDistribution(["[64,64]", "[128]", "True", "'a b'"]),
         ),
     ],
 )
@@ -60,7 +60,7 @@ def test_a_range_becomes_a_distribution(text, distribution):
     ("text", "reason"),
     [
         ("interval(3,1)", "`low <= high` must hold"),
-        ("tag(log,interval(0,1))", "must be larger than"),
+        ("tag(log,interval(0,1))", "`low > 0` must hold"),
         ("tag(lgo,interval(1,2))", "the only tag of a range is log"),
         ("range(3,3)", "the range is empty"),
         ("0.1", "a range is needed"),

@@ -55,7 +55,8 @@ def test_an_interrupted_search_tries_what_an_uninterrupted_one_does(tmp_path):
 def test_values_that_were_not_all_drawn_when_the_search_was_killed_are_drawn_again(tmp_path):
     (tmp_path / "whole").mkdir()
     whole = asked(tmp_path / "whole", trials=1)
-    with opened(tmp_path / "killed" if (tmp_path / "killed").mkdir() else tmp_path / "killed") as study:
+    (tmp_path / "killed").mkdir()
+    with opened(tmp_path / "killed") as study:
         study._study.ask({"x": SPACE["x"]})
     assert asked(tmp_path / "killed", trials=1) == whole
 
@@ -97,9 +98,9 @@ def test_a_study_of_something_else_is_refused_and_stays_as_it_is(tmp_path, other
     with opened(tmp_path) as study:
         study.ask()
     before = (tmp_path / "study.log").read_bytes()
-    with pytest.raises(UserError, match=r"holds a study of something else: choose another hydra\.run\.dir"):
-        with opened(tmp_path, **other):
-            pass
+    refused = pytest.raises(UserError, match=r"holds a study of something else: choose another hydra\.run\.dir")
+    with refused, opened(tmp_path, **other):
+        pass
     assert (tmp_path / "study.log").read_bytes() == before
 
 
