@@ -21,6 +21,7 @@ from physai.play import PlayConfig
 from physai.plot import PlotConfig
 from physai.ros.demo import DemoConfig
 from physai.ros.topics.commands import controller_topic
+from physai.search.config import SearchConfig
 from physai.signals import Quantity
 from physai.training.config import TrainConfig
 from tests.docs.blocks import ROOT, hooks
@@ -30,6 +31,7 @@ PACKAGE = ROOT / "physai" / "ros" / "package"
 SOURCES = "\n".join(path.read_text() for path in sorted((ROOT / "physai").rglob("*.py")))
 COMMANDS = {
     "physai.train": ("train", TrainConfig),
+    "physai.search": ("search", SearchConfig),
     "physai.evaluate": ("evaluate", EvaluateConfig),
     "physai.export": ("export", ExportConfig),
     "physai.play": ("play", PlayConfig),

@@ -18,7 +18,7 @@ from tests.docs.command_lines import SOURCES, check, exists, parameter_class
 from tests.test_contributing import EXAMPLE
 
 HOOKS = hooks()
-BROUGHT = ("collector", "env", "experiment", "logger", "objective", "policy", "randomization")
+BROUGHT = ("collector", "env", "experiment", "logger", "policy", "randomization")
 CONSOLE = {block.text.splitlines()[0]: block for block in blocks("console")}
 
 
