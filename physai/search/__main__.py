@@ -84,6 +84,9 @@ class Search:
             with Report(folder, study, settings.trials) as report:
                 run_trials(folder, study, config, self._fixed, report.ended)
             report.summary(self._fixed)
+        except KeyboardInterrupt:
+            print(f"\nInterrupted; go on with the same command and hydra.run.dir={folder}")
+            raise
         finally:
             study.close()
 
