@@ -4,7 +4,6 @@ import re
 import sys
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from omegaconf import DictConfig
 
@@ -12,9 +11,6 @@ from physai import cli
 from physai.compose import compose, parse
 from physai.config import validate
 from physai.errors import UserError
-
-if TYPE_CHECKING:
-    from physai.search.config import SearchConfig
 
 
 def main() -> None:
@@ -24,12 +20,6 @@ def main() -> None:
             raise UserError("a search takes ranges as they are, without -m")
         search = Search(cli.overrides())
     cli.main("search", search.run, search.check, search.common)
-
-
-def _config(node: DictConfig) -> "SearchConfig":
-    from physai.search.config import SearchConfig
-
-    return validate(SearchConfig, node)
 
 
 class Search:
@@ -51,38 +41,37 @@ class Search:
         if not find_spec("optuna"):
             raise UserError("a search needs Optuna: pip install 'physai[optuna]'")
         from physai.search import space
+        from physai.search.config import SearchConfig
         from physai.train import Training
 
-        settings = _config(node).search
-        ranges = space.ranges(settings.ranges, self._given)
-        if not ranges:
+        self._config = validate(SearchConfig, node)
+        self._ranges = space.ranges(self._config.search.ranges, self._given)
+        self._space = space.make_space(self._ranges)
+        if not self._space:
             raise UserError("there is nothing to search: give a range, such as algo.optimizer.lr=interval(1e-4,1e-2)")
         training = Training()
-        for values in space.samples(space.make_space(ranges)):
+        for values in space.samples(self._space):
             training.check(compose("train", [*self._fixed, *space.overrides(values)]))
 
-    def run(self, node: DictConfig, folder: Path) -> None:
+    def run(self, _: DictConfig, folder: Path) -> None:
         """Search, and report."""
-        from physai.search import space
         from physai.search.loop import run_trials
         from physai.search.report import Report
         from physai.search.study import Study
 
-        config = _config(node)
-        settings = config.search
-        ranges = space.ranges(settings.ranges, self._given)
+        settings = self._config.search
         about = {
             "fixed": sorted(one for one in self._fixed if not one.startswith("allow=")),
-            "ranges": ranges,
+            "ranges": self._ranges,
             "objective": settings.objective,
             "target": settings.target,
         }
-        study = Study(folder, about, space.make_space(ranges), config.seed, settings.minimize)
+        study = Study(folder, about, self._space, self._config.seed, settings.minimize)
         try:
-            if done := len(study.done()):
+            if done := study.done():
                 print(f"{folder}: {done} trials are done, {max(0, settings.trials - done)} are left.", flush=True)
             with Report(folder, study, settings.trials) as report:
-                run_trials(folder, study, config, self._fixed, report.ended)
+                run_trials(folder, study, self._config, self._fixed, report.ended)
             report.summary(self._fixed)
         except KeyboardInterrupt:
             print(f"\nInterrupted; go on with the same command and hydra.run.dir={folder}")

@@ -6,10 +6,10 @@ from pathlib import Path
 
 from optuna.trial import Trial
 
+from physai.search import trials
 from physai.search.config import SearchConfig
 from physai.search.space import overrides
 from physai.search.study import Study
-from physai.search.trials import TrialProcess, evaluations, success_rate, time_to_target
 
 _POLL = 0.5  # s between two looks at the evaluations of those that run
 _PATIENCE = 20.0  # s for a run to save itself
@@ -31,15 +31,15 @@ def run_trials(
     running: list[_Running] = []
     try:
         while True:
-            while len(running) < min(settings.jobs, settings.trials - len(study.done())):
+            while len(running) < min(settings.jobs, settings.trials - study.done()):
                 run, trial = study.ask()
                 values = ["export=[]", *fixed, *overrides(trial.params)]  # of many trials, few are for a robot
-                running.append(_Running(run, trial, TrialProcess(folder / str(run), values), config))
+                running.append(_Running(run, trial, folder / str(run), values, config))
             if not running:
                 return
             wait([one.process.sentinel for one in running], _POLL)
             for one in list(running):
-                over = one.process.ended  # before its last evaluations are read
+                over = not one.process.is_alive()  # before its last evaluations are read
                 one.look()
                 if over:
                     running.remove(one)
@@ -47,24 +47,25 @@ def run_trials(
                     ended(one.run)
     finally:
         for one in running:
-            one.process.stop()
+            one.process.terminate()
         for one in running:
             one.process.join(_PATIENCE)
+            one.process.kill()
 
 
 class _Running:
     """A trial that runs."""
 
-    def __init__(self, run: int, trial: Trial, process: TrialProcess, config: SearchConfig) -> None:
-        self.run, self.process = run, process
-        self._trial, self._settings = trial, config.search
+    def __init__(self, run: int, trial: Trial, folder: Path, values: Sequence[str], config: SearchConfig) -> None:
+        self.run, self._trial, self._folder, self._settings = run, trial, folder, config.search
         self._every_frames = config.evaluation.every_frames
         self._step = -1
         self._pruned = self._reached = False
+        self.process = trials.start(folder, values)
 
     def look(self) -> None:
         """Report new evaluations, and stop the run if they are worse than the median of the others' at that step."""
-        for one in evaluations(self.process.folder):
+        for one in trials.evaluations(self._folder):
             step = one.frames // self._every_frames
             if step > self._step:
                 self._step = step
@@ -72,12 +73,12 @@ class _Running:
                 self._trial.report(-one.success_rate if self._settings.minimize else one.success_rate, step)
                 if self._settings.prune and not (self._pruned or self._reached) and self._trial.should_prune():
                     self._pruned = True
-                    self.process.stop()
+                    self.process.terminate()
 
     def tell(self, study: Study) -> None:
         """Tell what came of it."""
-        value = success_rate(self.process.folder)
+        value = trials.success_rate(self._folder)
         if value is not None and self._settings.minimize:
-            value = time_to_target(self.process.folder, self._settings.target)
-        error = None if value is not None or self._pruned else self.process.error()
+            value = trials.time_to_target(self._folder, self._settings.target)
+        error = None if value is not None or self._pruned else trials.error(self._folder, self.process.exitcode or 0)
         study.tell(self._trial, value, error)

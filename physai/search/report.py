@@ -1,5 +1,6 @@
 """What a search shows: how far it is, a line for each trial, and in the end the best of them."""
 
+import math
 import shlex
 import sys
 from collections.abc import Iterable, Sequence
@@ -9,7 +10,7 @@ from typing import Any
 import pandas
 from rich.console import Console
 from rich.markup import escape
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.progress import Progress
 from rich.table import Table
 
 from physai import cli
@@ -32,11 +33,8 @@ class Report:
         self._folder, self._study = folder, study
         self._objective = "seconds to target" if study.minimize else "success rate"
         self._names = _short_names(study.space)
-        self._progress = Progress(
-            TextColumn("searching"), BarColumn(), MofNCompleteColumn(), TextColumn("trials"), TimeElapsedColumn(),
-            disable=not sys.stdout.isatty(),
-        )  # fmt: skip
-        self._task = self._progress.add_task("", total=trials, completed=len(study.done()))
+        self._progress = Progress(disable=not sys.stdout.isatty())
+        self._task = self._progress.add_task("searching", total=trials, completed=study.done())
 
     def __enter__(self) -> "Report":
         self._progress.start()
@@ -54,7 +52,7 @@ class Report:
             "FAIL": f"failed: {trial.user_attrs.get('error')}",
         }[trial.state.name]
         values = " ".join(f"{self._names[key]}={_short(value)}" for key, value in trial.params.items())
-        self._progress.update(self._task, completed=len(self._study.done()))
+        self._progress.update(self._task, completed=self._study.done())
         print(cli.printable(f"[{run}] {result}  ({values})"), flush=True)
 
     def summary(self, fixed: Sequence[str]) -> None:
@@ -73,25 +71,21 @@ class Report:
         ]  # fmt: skip
         table = pandas.DataFrame(rows)
         table.to_csv(self._folder / "study.csv", index=False)
-        best = table[table["state"] == "complete"].sort_values(self._objective, ascending=self._study.minimize)
+        best = table[table[self._objective] < math.inf].sort_values(self._objective, ascending=self._study.minimize)
         if best.empty:
-            print(f"error: none of {len(rows)} trials came to an end; output.txt of each says why", file=sys.stderr)
+            what = "reached the target" if self._study.minimize else "came to an end"
+            print(f"error: none of {len(rows)} trials {what}; the output.txt of each says why", file=sys.stderr)
             sys.exit(1)
-        self._show(best, len(rows))
+        shown = Table(title=escape(f"{self._folder}: the best of {len(rows)} trials"), title_justify="left")
+        for column in ("run", self._objective, *self._names.values()):
+            shown.add_column(escape(column), justify="left" if column == "run" else "right")
+        for row in best.head(_BEST).to_dict("records"):
+            shown.add_row(*(escape(_short(row[column])) for column in ("run", self._objective, *self._names)))
+        Console().print(shown)
         plot_study(table, self._objective, self._study.minimize, self._names, self._folder / "study.png")
         print(f"All trials: {self._folder / 'study.csv'}, {self._folder / 'study.png'}. Train with the best values:")
         values = trials[int(best["run"].iloc[0])].params
         print("  python -m physai.train " + shlex.join([*fixed, *overrides(values)]))
-
-    def _show(self, best: pandas.DataFrame, count: int) -> None:
-        title = f"{self._folder}: the best of {count} trials"
-        table = Table(title=escape(title), title_justify="left")
-        for column in ("run", self._objective, *self._names.values()):
-            table.add_column(escape(column), justify="left" if column == "run" else "right")
-        for row in best.head(_BEST).to_dict("records"):
-            values = (row[self._objective], *(row[key] for key in self._names))
-            table.add_row(str(row["run"]), *(escape(_short(value)) for value in values))
-        Console().print(table)
 
 
 def _short_names(keys: Iterable[str]) -> dict[str, str]:

@@ -70,11 +70,11 @@ class Study:
 
     def trials(self) -> dict[int, FrozenTrial]:
         """The last trial of each run, by the run's number."""
-        return {run: trial for run, trial in _runs(self._study.get_trials(deepcopy=False)) if _is_last(trial)}
+        return dict(_runs(self._study.get_trials(deepcopy=False)))
 
-    def done(self) -> list[int]:
-        """Runs that have come to an end by themselves, or were pruned."""
-        return [run for run, trial in self.trials().items() if trial.state.is_finished()]
+    def done(self) -> int:
+        """How many runs have come to an end by themselves, or were pruned."""
+        return sum(trial.state.is_finished() for trial in self.trials().values())
 
     def ask(self) -> tuple[int, Trial]:
         """Begin a trial, first those that were interrupted; return the number of its run, and itself."""
@@ -101,8 +101,9 @@ class Study:
         waiting = {run for run, trial in runs if trial.state is TrialState.WAITING}
         for run, trial in runs:
             if trial.state is TrialState.RUNNING:
-                # What was interrupted while its values were drawn has not all of them: they are drawn again.
-                values = trial.params if len(trial.params) == len(self.space) else {}
+                values = trial.system_attrs.get("fixed_params") or trial.params
+                if len(values) < len(self.space):  # it was interrupted while they were drawn
+                    values = {}
                 if "error" not in trial.user_attrs and run not in waiting:
                     self._study.enqueue_trial(values, user_attrs={"run": run})
                 self._study.tell(trial.number, state=TrialState.FAIL)
@@ -114,18 +115,12 @@ def _runs(trials: Sequence[FrozenTrial]) -> list[tuple[int, FrozenTrial]]:
     return [(trial.user_attrs["run"] if "run" in trial.user_attrs else next(count), trial) for trial in trials]
 
 
-def _is_last(trial: FrozenTrial) -> bool:
-    """Whether a run is not tried again after it."""
-    return trial.state is not TrialState.FAIL or "error" in trial.user_attrs
-
-
 def _create(path: Path, about: dict[str, Any], minimize: bool) -> None:
     """Make an empty study; the file is there only when it is whole."""
     temporary = path.with_name(f".{path.name}.tmp")
-    if others := {one.name for one in path.parent.iterdir()} - {temporary.name, f"{temporary.name}.lock"}:
+    temporary.unlink(missing_ok=True)
+    if others := [one.name for one in path.parent.iterdir() if not one.name.startswith(temporary.name)]:
         raise UserError(f"{path.parent} holds no study, but {min(others)}: choose another hydra.run.dir")
-    for left in path.parent.iterdir():
-        left.unlink()
     direction = StudyDirection.MINIMIZE if minimize else StudyDirection.MAXIMIZE
     study = optuna.create_study(study_name=_NAME, storage=_storage(temporary), direction=direction)
     study.set_user_attr("about", about)

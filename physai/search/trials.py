@@ -10,6 +10,7 @@ import shutil
 import signal
 import sys
 from collections.abc import Sequence
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import NamedTuple
 
@@ -29,45 +30,24 @@ class Evaluation(NamedTuple):
     success_rate: float
 
 
-class TrialProcess:
-    """A training run that has been started, or goes on from its last checkpoint.
+def start(folder: Path, overrides: Sequence[str]) -> BaseProcess:
+    """Start the process of a run, which may go on from its last checkpoint; SIGTERM makes it save itself and end.
 
     Args:
         folder: The run's.
         overrides: Its config.
-
-    Attributes:
-        sentinel: Ready when it has ended.
     """
+    process = _CONTEXT.Process(target=_run, args=(os.getpid(), Path.cwd(), folder, list(overrides)))
+    process.start()
+    return process
 
-    def __init__(self, folder: Path, overrides: Sequence[str]) -> None:
-        self.folder = folder
-        self._process = _CONTEXT.Process(target=_run, args=(os.getpid(), Path.cwd(), folder, list(overrides)))
-        self._process.start()
-        self.sentinel = self._process.sentinel
 
-    @property
-    def ended(self) -> bool:
-        """Whether it has."""
-        return not self._process.is_alive()
-
-    def stop(self) -> None:
-        """Ask it to save itself and end."""
-        self._process.terminate()
-
-    def join(self, seconds: float) -> None:
-        """Wait until it has ended; kill it if it takes longer."""
-        self._process.join(seconds)
-        if not self.ended:
-            self._process.kill()
-
-    def error(self) -> str:
-        """The last line that it printed, or what it died of."""
-        code = self._process.exitcode or 0
-        if code < 0:
-            return f"killed by {signal.Signals(-code).name}"
-        lines = (self.folder / OUTPUT).read_text(errors="replace").split("\n") if self.folder.is_dir() else []
-        return next((line.removeprefix("error: ") for line in reversed(lines) if line.strip()), f"exit code {code}")
+def error(folder: Path, code: int) -> str:
+    """The last line that a run printed, or what it died of."""
+    if code < 0:
+        return f"killed by {signal.Signals(-code).name}"
+    lines = (folder / OUTPUT).read_text(errors="replace").splitlines() if (folder / OUTPUT).is_file() else []
+    return next((line.removeprefix("error: ") for line in reversed(lines) if line.strip()), f"exit code {code}")
 
 
 def evaluations(folder: Path) -> list[Evaluation]:

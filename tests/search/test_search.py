@@ -109,7 +109,7 @@ def test_the_time_to_a_target_is_made_small(run, tmp_path):
 def test_a_trial_that_looks_worse_is_stopped_and_has_saved_itself(run, tmp_path, monkeypatch):
     monkeypatch.setattr("physai.search.study.MedianPruner", lambda: ThresholdPruner(lower=1.1))  # all do
     code, output, error = run("algo.optimizer.lr=interval(1e-3,1e-2)", "search.trials=1", "total_frames=100_000_000")
-    assert (code, error) == (1, "error: none of 1 trials came to an end; output.txt of each says why\n"), output
+    assert (code, error) == (1, "error: none of 1 trials came to an end; the output.txt of each says why\n"), output
     assert "[0] pruned  (" in output
     assert "everything is saved" in (tmp_path / "search" / "0" / "output.txt").read_text()
 

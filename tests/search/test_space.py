@@ -48,7 +48,7 @@ def test_what_the_command_line_says_goes_before_the_ready_ranges():
         ("0.9,0.99", CategoricalDistribution([0.9, 0.99])),
         (
             "choice([64,64],[128],true,'a b')",
-            CategoricalDistribution(["[64,64]", "[128]", "True", "'a b'"]),
+            CategoricalDistribution(["[64,64]", "[128]", "True", r"a\ b"]),
         ),
     ],
 )

@@ -61,6 +61,16 @@ def test_values_that_were_not_all_drawn_when_the_search_was_killed_are_drawn_aga
     assert asked(tmp_path / "killed", trials=1) == whole
 
 
+def test_values_that_were_not_all_taken_again_when_the_search_was_killed_are_taken_again(tmp_path):
+    with opened(tmp_path) as study:
+        params = study.ask()[1].params
+    with opened(tmp_path) as study:
+        study._study.ask({"x": SPACE["x"]})  # killed before it had taken the others
+    with opened(tmp_path) as study:
+        run, trial = study.ask()
+        assert (run, trial.params) == (0, params)
+
+
 def test_trials_that_were_interrupted_are_tried_again_and_those_that_ended_are_not(tmp_path):
     with opened(tmp_path) as study:
         trials = [study.ask()[1] for _ in range(4)]
@@ -68,7 +78,7 @@ def test_trials_that_were_interrupted_are_tried_again_and_those_that_ended_are_n
         study.tell(trials[1], error="the loss is not finite")
         study.tell(trials[2])
     with opened(tmp_path) as study:
-        assert study.done() == [0, 1, 2]
+        assert study.done() == 3
         run, again = study.ask()
         assert (run, again.params) == (3, trials[3].params)
         assert study.ask()[0] == 4
@@ -134,7 +144,7 @@ def test_a_last_line_that_was_not_written_to_its_end_and_a_lock_that_was_left_ar
     with opened(tmp_path) as study:
         assert study.ask()[0] == 1
     with opened(tmp_path) as study:
-        assert study.done() == [0]
+        assert study.done() == 1
 
 
 @pytest.mark.parametrize("evil", [{"run": "../.."}, {"run": 7}, {"run": True}, {"run": -1}])
@@ -180,4 +190,4 @@ def test_a_search_whose_trials_all_fail_ends_in_one_line_and_exit_code_1(tmp_pat
         with pytest.raises(SystemExit) as stop:
             Report(tmp_path, study, 1).summary([])
     assert stop.value.code == 1
-    assert capsys.readouterr().err == "error: none of 1 trials came to an end; output.txt of each says why\n"
+    assert capsys.readouterr().err == "error: none of 1 trials came to an end; the output.txt of each says why\n"
