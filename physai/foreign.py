@@ -147,8 +147,8 @@ def read_overrides(run_dir: Path) -> list[str]:
     for one in found:
         try:
             (parsed,) = parse([one])
-        except UserError:
-            raise UserError(f"{path}: {shown(one)} is not an override such as key=value") from None
+        except UserError as error:
+            raise UserError(f"{path}: {shown(one)} is not an override such as key=value") from error
         if "hydra" in f"{parsed.key_or_group} {parsed.package}":
             raise UserError(f"{path}: {shown(one)} is no business of a run folder")
     return found
@@ -173,7 +173,7 @@ def checked(
         _count(config)
         plain = OmegaConf.to_container(config, resolve=True)
     except Exception as error:  # whatever OmegaConf makes of it
-        raise UserError(f"{path}: the run's config is damaged ({' '.join(str(error).split())[:80]})") from None
+        raise UserError(f"{path}: the run's config is damaged ({' '.join(str(error).split())[:80]})") from error
     _refuse((fault for fault in _faults(plain, allow, resume) if not _is_own(fault, own, resolved=True)), path)
     _refuse((fault for fault in _impostors(plain, allow) if not _is_own(fault, own, resolved=True)), path)
     return plain
@@ -224,10 +224,10 @@ def _read(path: Path) -> Any:
             if isinstance(event, yaml.AliasEvent) or getattr(event, "tag", None) is not None:  # Hydra writes none
                 raise ValueError("it has an alias or a tag")
         return OmegaConf.to_container(OmegaConf.load(path))
-    except FileNotFoundError:
-        raise UserError(f"{path}: no such file") from None
+    except FileNotFoundError as error:
+        raise UserError(f"{path}: no such file") from error
     except Exception as error:  # whatever YAML makes of a truncated file
-        raise UserError(f"{path}: the run's config is damaged ({' '.join(str(error).split())[:80]})") from None
+        raise UserError(f"{path}: the run's config is damaged ({' '.join(str(error).split())[:80]})") from error
 
 
 @functools.lru_cache(2)

@@ -85,7 +85,7 @@ def _write(output: Path, frames: "list[np.ndarray]", frames_per_second: int) -> 
         else:
             imageio.imwrite(output, frames, fps=frames_per_second, macro_block_size=8)
     except OSError as error:
-        raise UserError(f"cannot write {output}: {error.strerror or error}") from None
+        raise UserError(f"cannot write {output}: {error.strerror or error}") from error
 
 
 if __name__ == "__main__":

@@ -33,7 +33,7 @@ def _plot(node: DictConfig, _: Path) -> None:
     try:
         plot_runs(runs, output)
     except (OSError, ValueError) as error:
-        raise UserError(f"cannot write {output}: {error}") from None
+        raise UserError(f"cannot write {output}: {error}") from error
     print(f"Curves: {output}")
 
 

@@ -46,7 +46,7 @@ def find(name: str) -> Any:
             raise
         except ModuleNotFoundError as error:
             if not f"{module}.".startswith(f"{error.name}."):  # it is there, and needs what is not
-                raise ValueError(f"{name} needs {not_installed(error.name or module)}") from None
+                raise ValueError(f"{name} needs {not_installed(error.name or module)}") from error
             outer, _, inner = module.rpartition(".")
             module, attribute = outer, f"{inner}.{attribute}"
             continue
@@ -66,8 +66,8 @@ def _in(found: Any, module: str, attribute: str) -> Any:
             found = getattr(outer, part)
         except UserError:
             raise
-        except Exception:  # a module may decide by itself what it has
-            raise ValueError(f"{module} has no '{attribute}'{nearest(attribute, dir(outer))}") from None
+        except Exception as error:  # a module may decide by itself what it has
+            raise ValueError(f"{module} has no '{attribute}'{nearest(attribute, dir(outer))}") from error
     if not callable(found):
         raise ValueError(f"{module}.{attribute} is of type {type(found).__name__}, which makes nothing")
     return found
@@ -93,7 +93,7 @@ def make(where: str, node: dict[str, Any], *arguments: Any, needs: Sequence[str]
     except Exception as error:  # whatever a part says to its arguments
         cause = (error.__cause__ or error) if isinstance(error, InstantiationException) else error
         if isinstance(cause, UserError):
-            raise cause from None
+            raise cause from cause.__cause__
         reason = " ".join(str(cause).split())
         plain = isinstance(cause, TypeError | ValueError | AttributeError | ImportError)
         raise UserError(f"{where}: {reason if reason and plain else f'{type(cause).__name__}: {reason}'}") from error
@@ -179,7 +179,7 @@ def _check_value(hint: Any, value: Any, path: str) -> Any:
         checked = adapter.validate_python(value)
     except ValidationError as error:
         message = error.errors()[0]["msg"]
-        raise ValueError(f"{path}: {message[0].lower()}{message[1:]}, got {shown(value)}") from None
+        raise ValueError(f"{path}: {message[0].lower()}{message[1:]}, got {shown(value)}") from error
     return checked if isinstance(checked, int | float | list) else value
 
 

@@ -1,5 +1,6 @@
 """What tests share: one thread, the environments that physai comes with, and runs that are made once."""
 
+import os
 import shutil
 import signal
 from collections.abc import Callable
@@ -26,6 +27,21 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 # A busy machine is no fault of a test: how long an example takes says nothing.
 settings.register_profile("physai", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("physai")
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    # An option of its own: of two -m, which a user may have given too, only the last counts.
+    parser.addoption(
+        "--realtime", choices=("only", "without"), help="choose by what measures time (the marker realtime)"
+    )
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    if (chosen := config.getoption("--realtime")) is None:
+        return
+    wanted = [item for item in items if (item.get_closest_marker("realtime") is not None) == (chosen == "only")]
+    config.hook.pytest_deselected(items=[item for item in items if item not in wanted])
+    items[:] = wanted
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -67,9 +83,12 @@ def any_env(request: pytest.FixtureRequest) -> EnvConfig:
 
 @pytest.fixture(scope="session")
 def once(tmp_path_factory: pytest.TempPathFactory, worker_id: str) -> Callable[[str, Callable[[Path], None]], Path]:
-    """Fill a folder once for all workers, and return it: ``once(name, fill)``; not to be written to afterwards."""
+    """Fill a folder once for all workers, and return it: ``once(name, fill)``; not to be written to afterwards.
+
+    Sessions that follow each other share them in the folder PHYSAI_TEST_RUNS, where there is one.
+    """
     base = tmp_path_factory.getbasetemp()
-    shared = base if worker_id == "master" else base.parent
+    shared = Path(os.environ.get("PHYSAI_TEST_RUNS") or (base if worker_id == "master" else base.parent))
 
     def once(name: str, fill: Callable[[Path], None]) -> Path:
         folder, done = shared / name, shared / f"{name}.done"

@@ -348,3 +348,17 @@ def test_a_sweep_ends_with_a_table_of_all_runs_and_a_failure_stands_out(tmp_path
     assert "error: 1 of 2 runs failed" in table
     assert (tmp_path / "sweep" / "training.png").is_file()
     assert (tmp_path / "sweep" / "0" / "summary.json").is_file()
+
+
+def nothing_plus_one(*_, **__):
+    return None + 1
+
+
+@pytest.mark.parametrize("full", ["0", "1"])
+def test_an_error_within_a_part_of_ones_own_is_one_line_and_a_traceback_on_demand(run, monkeypatch, full):
+    monkeypatch.setenv("HYDRA_FULL_ERROR", full)
+    own = "+algo.optimizer={_target_: tests.test_commands.nothing_plus_one}"
+    code, _, error = run("train", "~algo.optimizer", own, *SMALL)
+    *traceback, line = error.splitlines()
+    assert (code, line[:7]) == (2, "error: "), error
+    assert ("    return None + 1" in traceback) == (full == "1")

@@ -13,8 +13,8 @@ from torchrl.data.replay_buffers import RandomSampler
 from torchrl.objectives import DDPGLoss, TargetNetUpdater, TD3Loss
 from torchrl.objectives.utils import ValueEstimators
 
-from physai.algorithms.descent import Descent, check_ranges
 from physai.algorithms.interface import Networks
+from physai.algorithms.loss_optimizer import LossOptimizer, check_ranges
 from physai.algorithms.proportional import ProportionalSampler
 from physai.config import Count, NonNegativeFloat, PositiveFloat
 from physai.errors import UserError
@@ -74,10 +74,10 @@ class OffPolicy:
         try:
             self.loss = loss(networks.actor, networks.critic)
         except ValueError as error:
-            raise UserError(f"algo.loss: {error}") from None
-        except (AttributeError, IndexError):  # no get_dist, or no log_prob_keys
+            raise UserError(f"algo.loss: {error}") from error
+        except (AttributeError, IndexError) as error:  # no get_dist, or no log_prob_keys
             name = type(networks.actor).__name__
-            raise UserError(f"policy.actor: this loss draws from a distribution, and {name} has none") from None
+            raise UserError(f"policy.actor: this loss draws from a distribution, and {name} has none") from error
         if (drawn := getattr(self.loss.tensor_keys, "action", "action")) != "action":
             raise UserError(f"policy.actor: this loss would learn from '{drawn}', and the critic judges 'action'")
         judged = {_path(key) for key in networks.critic.in_keys}
@@ -87,7 +87,7 @@ class OffPolicy:
         check_ranges("algo", self.loss.value_estimator)
         self._squared = isinstance(self.loss, TD3Loss | DDPGLoss)  # so is the error that these report
         self._target = target(self.loss)
-        self.descent = Descent(self.loss, optimizer, scheduler, max_grad_norm)
+        self.optimizer = LossOptimizer(self.loss, optimizer, scheduler, max_grad_norm)
         self.warmup_frames = warmup_frames
         self.buffer = buffer
         self.minibatch_size = minibatch_size
@@ -128,7 +128,7 @@ class OffPolicy:
             if learning:
                 self._steps += 1
                 leave_out = "loss_actor" if self._steps % self._actor_every else ""
-                figures.set("grad_norm", self.descent.step(losses, minibatch, leave_out))
+                figures.set("grad_norm", self.optimizer.step(losses, minibatch, leave_out))
                 self._target.step()
             else:
                 figures.set("grad_norm", torch.zeros(()))
@@ -138,20 +138,20 @@ class OffPolicy:
             errors = torch.cat(priorities)
             self.buffer.update_priority(drawn.get("index"), errors.sqrt() if self._squared else errors)
         means: TensorDictBase = torch.stack(results).mean(dim=0)
-        return {key: float(value) for key, value in means.items()} | {"lr": self.descent.end_batch()}
+        return {key: float(value) for key, value in means.items()} | {"lr": self.optimizer.end_batch()}
 
     def weights(self) -> dict[str, Tensor]:
         """All weights by name, target networks included."""
-        return self.descent.weights()
+        return self.optimizer.weights()
 
     def state(self) -> dict[str, Any]:
         """Return what ``set_state`` needs to go on bit for bit: all frames in the buffer, too."""
         held = len(self.buffer)
         frames = self.buffer.storage.get(range(held)) if held else TensorDict({}, [0])
         return {
-            **self.descent.state(),
+            **self.optimizer.state(),
             "frames": {".".join(key): frames.get(key).clone() for key in self._keys} if held else {},
-            "cursor": self.buffer.writer._cursor,
+            "writer": self.buffer.writer.state_dict(),
             "seen": self._seen,
             "steps": self._steps,
             "sampler": self.buffer.sampler.state_dict(),
@@ -160,14 +160,14 @@ class OffPolicy:
 
     def set_state(self, state: dict[str, Any]) -> None:
         """Restore what ``state`` returned."""
-        self.descent.set_state(state)
+        self.optimizer.set_state(state)
         self.buffer.empty()
         if state["frames"]:
             held = TensorDict({}, [len(next(iter(state["frames"].values())))])
             for name, values in state["frames"].items():
                 held.set(tuple(name.split(".")), values)
             self.buffer.extend(held)
-        self.buffer.writer._cursor = state["cursor"]
+        self.buffer.writer.load_state_dict(state["writer"])
         self.buffer.sampler.load_state_dict(state["sampler"])
         self._seen, self._steps = state["seen"], state["steps"]
         self._generator.set_state(state["generator"])

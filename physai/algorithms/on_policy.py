@@ -10,8 +10,8 @@ from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LRScheduler
 from torchrl.data import TensorDictReplayBuffer
 
-from physai.algorithms.descent import Descent, check_ranges
 from physai.algorithms.interface import Networks
+from physai.algorithms.loss_optimizer import LossOptimizer, check_ranges
 from physai.config import Count, PositiveFloat
 from physai.errors import UserError
 
@@ -67,7 +67,7 @@ class OnPolicy:
         self.loss = loss(actor_network=networks.actor, critic_network=networks.critic)
         self.advantage = advantage(value_network=networks.critic)
         check_ranges("algo.advantage", self.advantage)
-        self.descent = Descent(self.loss, optimizer, scheduler, max_grad_norm)
+        self.optimizer = LossOptimizer(self.loss, optimizer, scheduler, max_grad_norm)
         self.buffer = buffer
         self.minibatch_size = minibatch_size
         self._device = networks.device
@@ -96,12 +96,12 @@ class OnPolicy:
         for _ in range(self.epochs):
             for minibatch in self._sequences(frames) if self._in_sequences else self._minibatches():
                 losses = self.loss(minibatch)
-                results.append(losses.set("grad_norm", self.descent.step(losses, minibatch)))
+                results.append(losses.set("grad_norm", self.optimizer.step(losses, minibatch)))
         with torch.no_grad():
             means: TensorDictBase = torch.stack(results).mean(dim=0)
             metrics = {key: float(value) for key, value in means.items()}
             metrics["explained_variance"] = _explained_variance(*(batch.get(key) for key in self._judged))
-        return metrics | {"lr": self.descent.end_batch()}
+        return metrics | {"lr": self.optimizer.end_batch()}
 
     def _sequences(self, frames: TensorDictBase) -> Iterator[TensorDictBase]:
         """Whole rows of frames [N, T], in another order for each epoch."""
@@ -116,15 +116,15 @@ class OnPolicy:
 
     def weights(self) -> dict[str, Tensor]:
         """All weights by name."""
-        return self.descent.weights()
+        return self.optimizer.weights()
 
     def state(self) -> dict[str, Any]:
         """Return what ``set_state`` needs to go on bit for bit."""
-        return self.descent.state()
+        return self.optimizer.state()
 
     def set_state(self, state: dict[str, Any]) -> None:
         """Restore what ``state`` returned."""
-        self.descent.set_state(state)
+        self.optimizer.set_state(state)
 
 
 def _explained_variance(value: Tensor, target: Tensor) -> float:

@@ -126,7 +126,7 @@ def _load_as_a_robot_would(content: bytes) -> Metadata:
         try:
             policy = load_policy(path, hashlib.sha256(content).hexdigest())
         except PolicyError as error:
-            raise gate.GateError(f"the loader refuses the file: {str(error).removeprefix(f'{path}: ')}") from None
+            raise gate.GateError(f"the loader refuses the file: {str(error).removeprefix(f'{path}: ')}") from error
     if policy.golden_error:
         raise gate.GateError(f"the loaded file differs from its golden pairs by {policy.golden_error:.3g}")
     return policy.metadata

@@ -228,8 +228,8 @@ def ask_fresh_process(content: bytes, policy: DeployablePolicy, states: States) 
         command = [sys.executable, "-I", fresh_process.__file__, str(file), str(inputs), str(given)]
         try:
             process = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE)
-        except subprocess.TimeoutExpired:
-            raise GateError(f"a fresh process without physai took longer than {PATIENCE} s") from None
+        except subprocess.TimeoutExpired as error:
+            raise GateError(f"a fresh process without physai took longer than {PATIENCE} s") from error
         if process.returncode:
             last = (process.stderr.strip().splitlines() or ["no reason given"])[-1]
             raise GateError(f"a fresh process without physai cannot run the file: {last[:160]}")

@@ -28,7 +28,7 @@ def show(path: Path) -> None:
     try:
         console.print(_summary(path, metadata))
     except (KeyError, TypeError, ValueError) as error:  # of the parts that no robot needs
-        raise PolicyError(f"{path}: the metadata lacks {error}") from None
+        raise PolicyError(f"{path}: the metadata lacks {error}") from error
     console.print(_joints(metadata))
 
 
@@ -41,7 +41,7 @@ def _read_onnx(path: Path) -> Metadata:
             raise PolicyError("an ONNX file, but no physai policy")
         return Metadata.parse(text)
     except UserError as error:
-        raise PolicyError(f"{path}: {str(error).removeprefix(f'{path}: ')}") from None
+        raise PolicyError(f"{path}: {str(error).removeprefix(f'{path}: ')}") from error
 
 
 def _summary(path: Path, metadata: Metadata) -> Table:

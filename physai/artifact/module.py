@@ -199,7 +199,7 @@ def script(policy: DeployablePolicy) -> torch.jit.ScriptModule:
             return scripted
     except Exception as error:  # the compiler's errors have no base class of their own
         reason = " ".join(str(error).split())[:160]
-        raise UserError(f"the policy cannot be exported: a part of it is no TorchScript ({reason})") from None
+        raise UserError(f"the policy cannot be exported: a part of it is no TorchScript ({reason})") from error
 
 
 def save(scripted: torch.jit.ScriptModule, metadata: str | None = None) -> bytes:

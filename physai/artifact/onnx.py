@@ -52,7 +52,7 @@ def convert(policy: DeployablePolicy, states: States) -> bytes:
             )
         except Exception as error:  # its own hierarchy is private
             reason = " ".join(re.sub(r"\x1b\[[0-9;]*m", "", str(error)).split())[:160]  # it likes colours
-            raise UserError(f"the policy cannot be exported to ONNX ({reason})") from None
+            raise UserError(f"the policy cannot be exported to ONNX ({reason})") from error
         assert program is not None
         return _without_notes(program.model_proto).SerializeToString()
 
@@ -85,7 +85,7 @@ def read_metadata(content: bytes) -> str | None:
     try:
         model = onnx.load_from_string(content)
     except Exception as error:  # protobuf's errors differ between its implementations
-        raise UserError(f"not an ONNX file ({' '.join(str(error).split())[:80]})") from None
+        raise UserError(f"not an ONNX file ({' '.join(str(error).split())[:80]})") from error
     return {entry.key: entry.value for entry in model.metadata_props}.get(METADATA)
 
 
@@ -102,7 +102,7 @@ class Runtime:
         try:
             self._session = onnxruntime.InferenceSession(content, providers=["CPUExecutionProvider"])
         except Exception as error:  # its classes are private
-            raise UserError(f"ONNX Runtime refuses the file ({' '.join(str(error).split())[:160]})") from None
+            raise UserError(f"ONNX Runtime refuses the file ({' '.join(str(error).split())[:160]})") from error
 
     def __call__(self, *inputs: Tensor) -> Tensor | tuple[Tensor, ...]:
         """Map a policy's inputs, [N, ...] each, to its outputs, as its module does."""

@@ -31,13 +31,13 @@ def measure_algorithms(seed: int, sb3_seconds: float) -> dict[str, tuple[Race, R
     races = {}
     for name in ALGORITHMS:
         config = reacher(seed, f"algo={name}", "randomization=none")
-        judge = make_evaluation_env(config, config.randomization, GOALS, GOALS_SEED)
+        evaluator = make_evaluation_env(config, config.randomization, GOALS, GOALS_SEED)
         try:
-            ours = race_physai(config, Race(f"physai {name}", TARGET), judge)
+            ours = race_physai(config, Race(f"physai {name}", TARGET), evaluator)
             learner = sb3.Learner(sb3.as_it_comes(name), seed)
-            races[name] = ours, race_sb3(learner, Race(f"SB3 {name}", TARGET), judge, max_seconds=sb3_seconds)
+            races[name] = ours, race_sb3(learner, Race(f"SB3 {name}", TARGET), evaluator, max_seconds=sb3_seconds)
         finally:
-            judge.close()
+            evaluator.close()
     return races
 
 

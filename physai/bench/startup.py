@@ -1,4 +1,4 @@
-"""How soon a command answers, how soon it trains, and how long a judgement takes."""
+"""How soon a command answers, how soon it trains, and how long an evaluation takes."""
 
 import statistics
 import subprocess

@@ -51,16 +51,16 @@ class Race:
 def run_race(
     race: Race,
     learn: Callable[[], int],
-    judge: Callable[[], float],
+    evaluator: Callable[[], float],
     max_frames: float = math.inf,
     max_seconds: float = math.inf,
 ) -> Race:
-    """Learn until a judgement finds the target reached, or until it takes too long; return the race.
+    """Learn until an evaluation finds the target reached, or until it takes too long; return the race.
 
     Args:
         race: At its start.
         learn: One iteration of collecting and learning; returns its frames.
-        judge: Returns the success rate of the policy as it is.
+        evaluator: Returns the success rate of the policy as it is.
         max_frames: Where to give up.
         max_seconds: When to give up.
     """
@@ -70,7 +70,7 @@ def run_race(
             frames, seconds = timed(learn)
             race.frames += frames
             race.seconds += seconds
-        race.success_rate = judge()
+        race.success_rate = evaluator()
         print(
             f"{race.name}: {race.frames:>9,} frames  {race.seconds:6.1f} s  {race.frames_per_second:>6,.0f}/s  "
             f"success {race.success_rate:6.1%}",
@@ -106,24 +106,24 @@ def measure_training(seed: int, seeds: int, sb3_seconds: float) -> dict[str, lis
     }
     threads = {name: sb3.fastest_threads(name, settings) for name, settings in theirs.items()}
     plain = reacher(seed, "randomization=none")
-    judge = make_evaluation_env(plain, plain.randomization, GOALS, GOALS_SEED)
+    evaluator = make_evaluation_env(plain, plain.randomization, GOALS, GOALS_SEED)
     races: dict[str, list[Race]] = {name: [] for name in (*ours, *theirs)}
     try:
         for one in range(seed, seed + seeds):  # the sides take turns, so that a busy machine slows them alike
             for name, overrides in ours.items():
                 config = reacher(one, "randomization=none", *overrides)
-                races[name].append(race_physai(config, Race(f"{name}, seed {one}"), judge))
+                races[name].append(race_physai(config, Race(f"{name}, seed {one}"), evaluator))
             for name, settings in theirs.items():
                 learner = sb3.Learner(settings, one, threads[name])
                 limits = {"max_seconds": sb3_seconds, "max_frames": settings.horizon or math.inf}
-                races[name].append(race_sb3(learner, Race(f"{name}, seed {one}"), judge, **limits))
+                races[name].append(race_sb3(learner, Race(f"{name}, seed {one}"), evaluator, **limits))
         return races
     finally:
-        judge.close()
+        evaluator.close()
 
 
-def race_physai(config: TrainConfig, race: Race, judge: TransformedRobotEnv) -> Race:
-    """Let physai learn by a config until the judge's goals are reached, or until its ``total_frames``."""
+def race_physai(config: TrainConfig, race: Race, evaluator: TransformedRobotEnv) -> Race:
+    """Let physai learn by a config until the evaluator's goals are reached, or until its ``total_frames``."""
     agent = Agent.build(config)
     batches = iter(agent.collector)
 
@@ -134,9 +134,9 @@ def race_physai(config: TrainConfig, race: Race, judge: TransformedRobotEnv) -> 
         return batch.numel()
 
     def success_rate() -> float:
-        judge.normalizer.load_state_dict(agent.statistics.normalizer.state_dict())
+        evaluator.normalizer.load_state_dict(agent.statistics.normalizer.state_dict())
         with _workers_at_rest():
-            return evaluate(agent.actor, judge, GOALS, GOALS_SEED).success_rate
+            return evaluate(agent.actor, evaluator, GOALS, GOALS_SEED).success_rate
 
     try:
         return run_race(race, learn, success_rate, max_frames=config.total_frames)
@@ -157,12 +157,12 @@ def _workers_at_rest() -> Iterator[None]:
             os.kill(worker, signal.SIGCONT)
 
 
-def race_sb3(learner: sb3.Learner, race: Race, judge: TransformedRobotEnv, **limits: float) -> Race:
-    """Let Stable-Baselines3 learn until the judge's goals are reached, or until a limit of ``run_race``."""
+def race_sb3(learner: sb3.Learner, race: Race, evaluator: TransformedRobotEnv, **limits: float) -> Race:
+    """Let Stable-Baselines3 learn until the evaluator's goals are reached, or until a limit of ``run_race``."""
     policy = TensorDictModule(learner.act, in_keys=learner.in_keys, out_keys=["action"])
 
     def success_rate() -> float:
-        return evaluate(policy, judge, GOALS, GOALS_SEED).success_rate
+        return evaluate(policy, evaluator, GOALS, GOALS_SEED).success_rate
 
     try:
         return run_race(race, learner.learn, success_rate, **limits)

@@ -86,7 +86,8 @@ def overrides() -> list[str]:
 class guard:  # noqa: N801
     """Context in which what a user or a disk does wrong ends in one line and exit code 2, and Ctrl-C in 130.
 
-    Other signals end it like Ctrl-C, so that a robot is not left moving.
+    With ``HYDRA_FULL_ERROR=1`` the traceback comes before the line. Other signals end it like Ctrl-C, so that a robot
+    is not left moving.
     """
 
     def __enter__(self) -> None:
@@ -95,6 +96,8 @@ class guard:  # noqa: N801
     def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
         for number, handler in self._before.items():
             signal.signal(number, handler)
+        if isinstance(error, UserError | OSError) and os.environ.get("HYDRA_FULL_ERROR") == "1":
+            traceback.print_exception(error)
         if isinstance(error, UserError):
             print(f"error: {printable(str(error))}", file=sys.stderr)
             sys.exit(2)

@@ -94,6 +94,6 @@ def make_collector(
         try:
             from physai.collectors.ray import RobotRayCollector  # it takes its time, and is there only if wanted
         except ModuleNotFoundError as error:
-            raise UserError(f"collector.ray_init needs {error.name}: pip install 'physai[ray]'") from None
+            raise UserError(f"collector.ray_init needs {error.name}: pip install 'physai[ray]'") from error
         return RobotRayCollector(*parts, ray_init=config.ray_init, **sizes)
     return (RobotMultiSyncCollector if config.sync else RobotMultiAsyncCollector)(*parts, **sizes)

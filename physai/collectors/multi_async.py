@@ -59,9 +59,9 @@ class RobotMultiAsyncCollector(RobotMultiCollector, MultiAsyncCollector):
         while worker not in self._waiting:
             try:
                 sender, _, batch = self._get_from_queue(timeout=1)
-            except Empty:
+            except Empty as error:
                 if any(process.exitcode is not None for process in self.procs):
-                    raise RuntimeError("a worker has died") from None
+                    raise RuntimeError("a worker has died") from error
             else:
                 self._waiting[sender] = batch
 

@@ -47,7 +47,7 @@ def read(path: Path) -> bytes:
             raise PolicyError(f"{path}: the file is empty")
         return path.read_bytes()
     except (OSError, ValueError) as error:
-        raise PolicyError(f"{path}: cannot be read ({error})") from None
+        raise PolicyError(f"{path}: cannot be read ({error})") from error
 
 
 def check(path: Path, content: bytes) -> Archive:
@@ -62,9 +62,9 @@ def check(path: Path, content: bytes) -> Archive:
     try:
         records = _records(content)
     except PolicyError as error:
-        raise PolicyError(f"{path}: {error}") from None
+        raise PolicyError(f"{path}: {error}") from error
     except Exception as error:  # whatever zipfile makes of hostile bytes
-        raise PolicyError(f"{path}: the archive is damaged ({_line(error)})") from None
+        raise PolicyError(f"{path}: the archive is damaged ({_line(error)})") from error
     for needed in ("data.pkl", "constants.pkl", "version"):
         if needed not in records:
             raise PolicyError(f"{path}: not a TorchScript file ({needed} is missing)")
@@ -72,8 +72,8 @@ def check(path: Path, content: bytes) -> Archive:
         raise PolicyError(f"{path}: a TorchScript file, but no physai policy ({METADATA} is missing)")
     try:
         metadata = records[f"extra/{METADATA}"].decode()
-    except UnicodeDecodeError:
-        raise PolicyError(f"{path}: {METADATA} is not UTF-8") from None
+    except UnicodeDecodeError as error:
+        raise PolicyError(f"{path}: {METADATA} is not UTF-8") from error
     return Archive(_rewritten(records), metadata, _digest(records))
 
 

@@ -91,7 +91,7 @@ class CheckedPolicy:
         try:
             return call()
         except Exception as error:
-            raise AnswerError("exception", f"raised {type(error).__name__}: {_last_line(error)}") from None
+            raise AnswerError("exception", f"raised {type(error).__name__}: {_last_line(error)}") from error
 
 
 def _last_line(error: Exception) -> str:

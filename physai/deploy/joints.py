@@ -129,7 +129,7 @@ class JointReader:
         try:
             return self._read(state, now)
         except (TypeError, ValueError, OverflowError) as error:  # names, stamps or lists that are none
-            raise JointStateError("malformed", f"it is malformed ({str(error)[:60]})") from None
+            raise JointStateError("malformed", f"it is malformed ({str(error)[:60]})") from error
 
     def _read(self, state: JointState, now: float) -> Heard | None:
         names = tuple(state.names)

@@ -105,7 +105,7 @@ class Metadata:
         try:
             raw = json.loads(text, parse_constant=_refuse_constant)
         except (ValueError, RecursionError) as error:
-            raise PolicyError(f"the metadata is damaged ({str(error)[:80]})") from None
+            raise PolicyError(f"the metadata is damaged ({str(error)[:80]})") from error
         if not isinstance(raw, dict) or raw.get("format") != FORMAT:
             raise PolicyError("the metadata is not that of a physai policy")
         if raw.get("format_version") is True or raw.get("format_version") != FORMAT_VERSION:
@@ -284,7 +284,7 @@ def _region(raw: dict[str, Any]) -> Region:
             }
         return REGIONS[kind](**fields)
     except (TypeError, ValueError, OverflowError) as error:
-        raise PolicyError(f"metadata: goal.region: {' '.join(str(error).split())[:120]}") from None
+        raise PolicyError(f"metadata: goal.region: {' '.join(str(error).split())[:120]}") from error
 
 
 def _tolerances(raw: dict[str, Any]) -> tuple[Tolerance, ...]:
@@ -315,8 +315,8 @@ def _array(
             raise TypeError
         with np.errstate(over="ignore"):
             array: np.ndarray = np.array(value, dtype=np.float64).astype(kind)
-    except (TypeError, ValueError, OverflowError, RecursionError):
-        raise PolicyError(f"metadata: {key} must hold numbers") from None
+    except (TypeError, ValueError, OverflowError, RecursionError) as error:
+        raise PolicyError(f"metadata: {key} must hold numbers") from error
     if array.shape != shape:
         raise PolicyError(f"metadata: {key} must have the shape {list(shape)}, not {list(array.shape)}")
     if infinite:  # JSON has no infinity: null stands for a limit that does not exist

@@ -133,9 +133,9 @@ def load_policy(path: str | Path, sha256: str | None = None, expect_joints: Sequ
         policy = Policy(load_module(checked.content, inputs), metadata, digest)
         policy.golden_error = _golden_error(policy)
     except PolicyError as error:
-        raise PolicyError(f"{path}: {error}") from None
+        raise PolicyError(f"{path}: {error}") from error
     except Exception as error:  # whatever torch makes of a program that is not ours
-        raise PolicyError(f"{path}: cannot be run ({' '.join(str(error).split())[:120]})") from None
+        raise PolicyError(f"{path}: cannot be run ({' '.join(str(error).split())[:120]})") from error
     return policy
 
 
@@ -151,7 +151,7 @@ def _described(path: Path, checked: archive.Archive) -> Metadata:
     try:
         metadata = Metadata.parse(checked.metadata)
     except PolicyError as error:
-        raise PolicyError(f"{path}: {error}") from None
+        raise PolicyError(f"{path}: {error}") from error
     if metadata.content_sha256 != checked.content_sha256:
         raise PolicyError(f"{path}: its code or weights are not those that were exported (content_sha256 differs)")
     return metadata

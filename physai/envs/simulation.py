@@ -204,7 +204,8 @@ class Simulation:
         terminated = self.task.terminated(step, success)
         rewards = np.stack(list(self.task.rewards(step, success).values()), axis=1).astype(np.float32)
         if rows is not None:
-            self.within[rows], success[rows], terminated[rows], rewards[rows] = 0, False, False, 0.0
+            self.within[rows], rewards[rows] = 0, 0.0
+            success, terminated = _replaced(success, rows, False), _replaced(terminated, rows, False)  # the task's own
         self.success, terminated = success[:, None], terminated[:, None]
         self.episode_length = length
         self.episode_rewards = self.episode_rewards + rewards

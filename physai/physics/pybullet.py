@@ -231,7 +231,7 @@ def _make_world(spec: RobotSpec, model: Path, robots: int, time_step: float) -> 
         ]
     except bullet.error as error:
         bullet.disconnect(client)
-        raise UserError(f"{spec.urdf}: PyBullet cannot load it: {error}") from None
+        raise UserError(f"{spec.urdf}: PyBullet cannot load it: {error}") from error
     for body in bodies:
         for link in range(-1, bullet.getNumJoints(body, client)):
             # The damping that counts is that of the joints.

@@ -57,8 +57,8 @@ def _episodes(run: Path) -> pd.DataFrame:
     foreign.check_links(run)
     try:
         episodes = pd.read_csv(path)[["frame", "return", "length"]].astype(float)
-    except (ValueError, KeyError):
-        raise UserError(f"{path}: the run's episodes are damaged") from None
+    except (ValueError, KeyError) as error:
+        raise UserError(f"{path}: the run's episodes are damaged") from error
     if episodes.empty:
         raise UserError(f"{run}: no episode has ended yet, there is nothing to draw")
     return episodes

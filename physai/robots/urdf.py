@@ -33,8 +33,8 @@ def resolve(uri: str) -> Path:
         package, _, inside = uri.removeprefix("package://").partition("/")
         try:
             path = Path(str(importlib.resources.files(package))) / inside
-        except (ModuleNotFoundError, ValueError):
-            raise UserError(f"{uri}: there is no Python package '{package}' here") from None
+        except (ModuleNotFoundError, ValueError) as error:
+            raise UserError(f"{uri}: there is no Python package '{package}' here") from error
     if not path.is_file():
         raise UserError(f"{uri}: no such URDF file ({path})")
     return path.resolve()
@@ -49,7 +49,7 @@ def parse(path: Path) -> etree._ElementTree:
     try:
         tree = etree.parse(path, etree.XMLParser(remove_comments=True))
     except (etree.XMLSyntaxError, OSError) as error:
-        raise UserError(f"{path}: not well-formed XML: {' '.join(str(error).split())}") from None
+        raise UserError(f"{path}: not well-formed XML: {' '.join(str(error).split())}") from error
     root = tree.getroot()
     if root.tag != "robot" or "name" not in root.attrib:
         raise UserError(f"{path}: the top element must be <robot name=...>, found <{root.tag}>")
@@ -83,7 +83,7 @@ def load(path: Path) -> Robot:
         with contextlib.redirect_stderr(io.StringIO()):  # where it names every tag that it does not know
             return Robot.from_xml_string(etree.tostring(robot))
     except Exception as error:  # whatever the parser makes of it
-        raise UserError(f"{path}: not a valid URDF: {' '.join(str(error).split()) or type(error).__name__}") from None
+        raise UserError(f"{path}: not a valid URDF: {' '.join(str(error).split()) or type(error).__name__}") from error
 
 
 def transform(origin: Pose | None) -> np.ndarray:

@@ -30,6 +30,6 @@ def __getattr__(name: str) -> Any:
         raise AttributeError(f"module '{__name__}' has no attribute '{name}'")
     try:
         import rclpy  # noqa: F401
-    except ModuleNotFoundError:
-        raise UserError(_WITHOUT_ROS) from None
+    except ModuleNotFoundError as error:
+        raise UserError(_WITHOUT_ROS) from error
     return getattr(importlib.import_module(_HOMES[name]), name)

@@ -14,7 +14,7 @@ from omegaconf import DictConfig
 from rich.console import Console
 
 from physai import cli
-from physai.compose import compose
+from physai.compose import compose, conf_dir
 from physai.config import Config, Count, PositiveFloat, Seed, validate
 from physai.deploy import ControllerConfig, Metadata, load_policy, read_metadata
 from physai.deploy.limits import smallest_margin
@@ -58,17 +58,27 @@ class DemoConfig(Config):
 
 
 def robot_overrides(metadata: Metadata) -> list[str]:
-    """What makes the virtual robot the one that the policy was trained on: Hydra overrides of its env."""
+    """What makes the virtual robot the one that the policy was trained on: Hydra overrides of its env.
+
+    Raises:
+        UserError: If ``conf/robot`` has no such robot: a URDF that a policy file names is not read.
+    """
     robot = metadata.raw["config"]["env"]["robot"]
+    files = [path.stem for path in (conf_dir() / "robot").glob("*.yaml")]
+    if metadata.robot not in files:
+        raise UserError(f"the policy is for '{metadata.robot}', and conf/robot has only {', '.join(sorted(files))}")
     changed = ("joints", "end_effector", "home", "command", "command_limit", "position_gain")
-    return [f"env.robot.{key}={json.dumps(robot[key])}" for key in changed] + [
-        f"env.start.spread={json.dumps([0.0] * len(robot['joints']))}"
+    return [
+        f"robot@env.robot={metadata.robot}",
+        *(f"env.robot.{key}={json.dumps(robot[key])}" for key in changed),
+        f"env.start.spread={json.dumps([0.0] * len(robot['joints']))}",
     ]
 
 
 def _check(node: DictConfig) -> None:
     config = validate(DemoConfig, node)
     metadata = read_metadata(config.path())
+    robot_overrides(metadata)
     if node.randomization != compose("train", [f"randomization={config.robot}"]).randomization:
         raise UserError("randomization: the virtual robot takes a file of conf/randomization as it is")
     picture = config.picture()
@@ -123,12 +133,12 @@ def _demo(node: DictConfig, _: Path) -> None:
         goals = policy.metadata.region.sample(config.goals, torch.Generator().manual_seed(config.seed))
         for number, goal in enumerate(goals, 1):
             result = client.send(goal, config.hold)
-            console.print(f"  {number:>3}  {result.describe()}", highlight=False)
+            console.print(f"  {number:>3}  {result.describe()}", highlight=False, soft_wrap=True)
     output = config.picture()
     try:
         draw_drive(client.record, policy, output)
     except (OSError, ValueError) as error:
-        raise UserError(f"cannot write {output}: {error}") from None
+        raise UserError(f"cannot write {output}: {error}") from error
     kept = sum(result.kept for result in client.record.results)
     console.print(f"{kept} of {len(goals)} goals reached, and held for {config.hold:g} s. The path: {output}")
     if kept < len(goals):

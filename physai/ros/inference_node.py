@@ -305,7 +305,7 @@ def _commands(node: InferenceNode, joints: int, quantity: Quantity, config: Infe
     try:
         return WatchedCommands(node, joints, quantity, config.watchdog, config.watchdog_timeout)
     except (NameValidationException, RuntimeError) as error:  # RuntimeError: RCLError
-        raise UserError(f"watchdog: must be the name of a node, got '{config.watchdog}': {brief(error)}") from None
+        raise UserError(f"watchdog: must be the name of a node, got '{config.watchdog}': {brief(error)}") from error
 
 
 def _load(config: InferenceConfig) -> Policy:
@@ -337,7 +337,7 @@ def _first_goal(config: InferenceConfig, policy: Policy) -> Goal | None:
     try:
         accept(goal, policy.metadata, config.unreachable_goal == "project")
     except GoalError as error:
-        raise UserError(f"goal: {error}") from None
+        raise UserError(f"goal: {error}") from error
     return goal
 
 

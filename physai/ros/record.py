@@ -205,7 +205,7 @@ def _resolve(node: StoppableNode, topics: tuple[str, ...]) -> list[str]:
     try:
         return list(dict.fromkeys(node.resolve_topic_name(topic) for topic in topics))
     except RuntimeError as error:  # RCLError
-        raise UserError(f"topics: {brief(error)}") from None
+        raise UserError(f"topics: {brief(error)}") from error
 
 
 def _to_bag(offered: QoSProfile) -> Qos:

@@ -44,7 +44,7 @@ def make_space(ranges: Mapping[str, str]) -> Space:
         try:
             space[key] = _distribution(override)
         except (ValueError, HydraException) as error:
-            raise UserError(f"{key}={text}: {error}") from None
+            raise UserError(f"{key}={text}: {error}") from error
     return space
 
 

@@ -139,7 +139,7 @@ def _load(path: Path, about: dict[str, Any], space: Space) -> optuna.Study:
         trials, found = study.get_trials(), study.user_attrs.get("about")
     except Exception as error:  # whatever Optuna makes of a file of anyone's
         reason = (str(error) or type(error).__name__).splitlines()[0]
-        raise UserError(f"{path}: no study can be read there: {reason}") from None
+        raise UserError(f"{path}: no study can be read there: {reason}") from error
     if found != about or not all(_is_ours(trial, space, len(trials)) for trial in trials):
         raise UserError(f"{path.parent} holds a study of something else: choose another hydra.run.dir")
     return study

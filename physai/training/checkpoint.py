@@ -9,7 +9,7 @@ import torch
 from physai.errors import UserError
 from physai.files import write_atomically
 
-_FORMAT = 3
+_FORMAT = 4
 
 
 def save(path: Path, content: dict[str, Any]) -> None:
@@ -27,11 +27,11 @@ def load(path: Path) -> dict[str, Any]:
     """
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
-    except FileNotFoundError:
-        raise UserError(f"{path}: no such checkpoint") from None
+    except FileNotFoundError as error:
+        raise UserError(f"{path}: no such checkpoint") from error
     except Exception as error:  # whatever torch makes of a file that it did not write
         reason = (str(error) or type(error).__name__).splitlines()[0][:80]
-        raise UserError(f"{path}: the checkpoint is damaged ({reason})") from None
+        raise UserError(f"{path}: the checkpoint is damaged ({reason})") from error
     if not isinstance(content, dict) or content.get("format") != _FORMAT:
         raise UserError(f"{path}: not a checkpoint of this version of physai")
     return content

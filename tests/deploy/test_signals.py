@@ -38,15 +38,8 @@ class Reach(nn.Module):
         return torch.stack([far.amax(dim=1), far.sum(dim=1)], dim=1)
 
 
-class Point(nn.Module):
+class Point(Reach):
     """Takes a goal of three numbers for a place that the joints' angles are the coordinates of."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.gain = nn.Parameter(torch.tensor(4.0), requires_grad=False)
-
-    def forward(self, joint_position: Tensor, joint_velocity: Tensor, goal: Tensor) -> Tensor:
-        return torch.clamp(self.gain * (goal - joint_position), -2.0, 2.0)
 
     @torch.jit.export
     def error(self, joint_position: Tensor, goal: Tensor) -> Tensor:

@@ -16,7 +16,7 @@ from physai.ros.node.run import prepare_middleware
 
 prepare_middleware()
 
-from tests.ros.forge import close_forges
+from tests.ros.forge import ForgedProcess, close_forges
 from tests.ros.loop import Loop, closed_loop
 from tests.ros.peer import SHM, Peer, Process, free_domain, node_command, remove_dead_segments
 from tests.ros.stalls import Stalls
@@ -55,6 +55,16 @@ def pytest_runtest_protocol(item: pytest.Item, nextitem: pytest.Item | None) -> 
     return True
 
 
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    if hasattr(session.config, "workeroutput"):  # a worker of xdist tells the process that tells the user
+        session.config.workeroutput["repeated"] = session.config.stash[REPEATED]
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_testnodedown(node: Any, error: Any) -> None:
+    node.config.stash[REPEATED].extend(getattr(node, "workeroutput", {}).get("repeated", []))
+
+
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:
     if config.stash[REPEATED]:
         terminalreporter.section("repeated: the machine stood still")
@@ -82,18 +92,23 @@ def domain() -> Iterator[int]:
 
 @pytest.fixture
 def start(domain: int, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[..., Process]]:
-    """Start nodes of physai: ``start("virtual_robot", rate_hz=100)``; they are gone after the test."""
-    processes: list[Process] = []
-    own = {"XDG_STATE_HOME": str(tmp_path_factory.mktemp("state"))}  # no other test's emergency stop
+    """Start nodes of physai: ``start("virtual_robot", rate_hz=100)``; they are gone after the test.
 
-    def start(module: str, *args: str, env: dict[str, str] | None = None, **parameters: Any) -> Process:
-        processes.append(Process(node_command(module, *args, **parameters), domain, own | (env or {})))
+    They are forged, which is quick; ``start.run`` runs a command line, such as that of ``node_command``.
+    """
+    processes: list[Process] = []
+    state = tmp_path_factory.mktemp("state")  # no other test's emergency stop
+    own = {"XDG_STATE_HOME": str(state)}
+
+    def start(module: str, *args: str, **parameters: Any) -> Process:
+        arguments = node_command(module, *args, **parameters)[3:]  # of which one may be called output
+        processes.append(ForgedProcess(f"physai.ros.{module}", arguments, domain, state, None))
         return processes[-1]
 
     start.run = lambda command, env=None: processes.append(Process(command, domain, own | (env or {}))) or processes[-1]
     yield start
     with ThreadPoolExecutor() as pool:
-        list(pool.map(Process.end, processes))
+        list(pool.map(lambda process: process.end(), processes))
 
 
 @pytest.fixture

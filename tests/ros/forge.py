@@ -5,6 +5,7 @@ it, and it ends with its input.
 """
 
 import contextlib
+import ctypes
 import importlib
 import json
 import os
@@ -164,8 +165,18 @@ def _become(order: dict[str, Any], forge: int) -> None:
     sys.exit(importlib.import_module(order["module"]).main())
 
 
+def _import() -> None:
+    """What nodes need; PyBullet prints a line, of which neither the tests nor each node shall hear."""
+    stdout = os.dup(1)
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+    for module in ("inference_node", "virtual_robot", "record", "command_watchdog"):
+        importlib.import_module(f"physai.ros.{module}")
+    ctypes.CDLL(None).fflush(None)
+    os.dup2(stdout, 1)
+
+
 def _forge() -> None:
-    importlib.import_module("physai.ros.inference_node")
+    _import()
     forge = os.getpid()
     signal.signal(signal.SIGCHLD, _report)
     for line in iter(sys.stdin.readline, ""):

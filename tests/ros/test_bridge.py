@@ -49,6 +49,7 @@ def in_fresh_python(script):
     return subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=120)
 
 
+@pytest.mark.slow
 def test_gymnasium_s_checker_passes_without_a_warning(start_robot, make):
     start_robot()
     env = make().unwrapped
@@ -57,6 +58,7 @@ def test_gymnasium_s_checker_passes_without_a_warning(start_robot, make):
         check_env(env)
 
 
+@pytest.mark.slow
 def test_it_renders_and_closes_twice(start_robot, make):
     start_robot()
     env = make(render_mode="rgb_array")
@@ -66,6 +68,7 @@ def test_it_renders_and_closes_twice(start_robot, make):
     env.close()
 
 
+@pytest.mark.slow
 def test_a_second_env_takes_the_robot_over_and_the_first_says_so(start_robot, make):
     start_robot()
     first = make()
@@ -77,6 +80,8 @@ def test_a_second_env_takes_the_robot_over_and_the_first_says_so(start_robot, ma
     second.step(second.action_space.sample())
 
 
+@pytest.mark.slow
+@pytest.mark.realtime
 def test_an_episode_over_ros_is_the_episode_in_process(start_robot, make):
     start_robot()
     ours = make()
@@ -104,11 +109,13 @@ def test_without_rclpy_one_line_says_what_to_install():
     assert done.stdout == "rclpy is not installed: pip install 'physai[ros]', or source ROS 2 Jazzy\n", done.stderr
 
 
+@pytest.mark.slow
 def test_the_other_envs_need_no_rclpy():
     done = in_fresh_python(WITHOUT_ROS + "import physai; physai.make_env('reacher', 2).close()")
     assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.slow
 def test_where_there_is_no_robot_evaluate_says_so_in_one_line(start, run):
     command = start.run(evaluate(f"run={run}", "env=ros_reacher"))
     assert command.wait(60.0) == 2
@@ -116,6 +123,7 @@ def test_where_there_is_no_robot_evaluate_says_so_in_one_line(start, run):
     assert not list(run.glob("evaluation_*"))
 
 
+@pytest.mark.slow
 def test_evaluate_refuses_to_randomize_a_robot_behind_ros(start, start_robot, peer, run):
     start_robot()
     command = start.run(evaluate(f"run={run}", "env=ros_reacher", "randomization=default"))
@@ -124,6 +132,7 @@ def test_evaluate_refuses_to_randomize_a_robot_behind_ros(start, start_robot, pe
     assert not any(any(velocity) for _, velocity in peer.commands)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_an_interrupted_evaluation_leaves_a_standing_arm(start, start_robot, peer, run, number, code):
     start_robot()
@@ -141,12 +150,12 @@ def test_a_policy_reaches_the_same_goals_over_ros_as_in_process(start, start_rob
     start_robot()
     here = ["env=reacher", "env.start.spread=[0.0,0.0]", "randomization=none"]
     for arguments in (["env=ros_reacher"], here):
-        command = start.run(evaluate(f"run={run}", "episodes=50", *arguments))
+        command = start.run(evaluate(f"run={run}", "episodes=25", *arguments))
         assert command.wait(280.0) == 0, command.output
     over_ros, in_process = (
         json.loads((run / f"evaluation_{name}_none.json").read_text()) for name in ("ros_reacher", "reacher")
     )
     for name, result in (("over ROS", over_ros), ("in process", in_process)):
-        print(f"{name}: {result['success_rate']:.0%} of 50 goals, {result['steps_to_goal']:.1f} steps to goal")
-    assert abs(over_ros["success_rate"] - in_process["success_rate"]) <= 1 / 50 + 1e-9
+        print(f"{name}: {result['success_rate']:.0%} of 25 goals, {result['steps_to_goal']:.1f} steps to goal")
+    assert abs(over_ros["success_rate"] - in_process["success_rate"]) <= 1 / 25 + 1e-9
     assert over_ros["steps_to_goal"] == pytest.approx(in_process["steps_to_goal"], abs=3.0)

@@ -41,6 +41,7 @@ def passes(peer: Peer, *velocity: float) -> None:
     wait_for(there, what=f"{velocity} behind the watchdog")
 
 
+@pytest.mark.realtime
 def test_silence_becomes_zeros_again_and_again(watchdog):
     for _ in range(5):
         passes(watchdog, 0.1, 0.2)
@@ -50,6 +51,7 @@ def test_silence_becomes_zeros_again_and_again(watchdog):
         watchdog.all_zeros(after=since + TIMEOUT + 0.06, commands=10)
 
 
+@pytest.mark.realtime
 @pytest.mark.parametrize("nonsense", [(math.nan, 0.1), (0.1, math.inf), (0.1,), (0.1, 0.2, 0.3), ()])
 def test_nonsense_becomes_zeros(watchdog, nonsense):
     passes(watchdog, 0.1, 0.2)
@@ -81,6 +83,7 @@ def test_another_commander_of_the_controller_stops_the_arm(watchdog):
     passes(watchdog, 0.1, 0.2)
 
 
+@pytest.mark.realtime
 def test_who_commands_the_watchdog_may_stand_by_to_command_the_controller(watchdog):
     standby = watchdog.node.create_publisher(Float64MultiArray, TOPIC, 1)
     passes(watchdog, 0.1, 0.2)
@@ -92,6 +95,7 @@ def test_who_commands_the_watchdog_may_stand_by_to_command_the_controller(watchd
     assert watchdog.call("/command_watchdog/reset").success
 
 
+@pytest.mark.realtime
 def test_its_heart_beats_as_often_as_it_looks_and_not_while_it_stands_still(watchdog):
     beats = []
     passes(watchdog, 0.1, 0.2)  # it hears somebody
@@ -107,6 +111,7 @@ def test_its_heart_beats_as_often_as_it_looks_and_not_while_it_stands_still(watc
     wait_for(lambda: len(beats) > count + 5)
 
 
+@pytest.mark.realtime
 def test_what_waited_while_the_watchdog_stood_still_is_not_passed_on(watchdog):
     for _ in range(3):
         passes(watchdog, 0.1, 0.2)
@@ -167,6 +172,7 @@ def test_nonsense_does_not_tell_how_many_joints_there_are(nonsense):
             peer.close()
 
 
+@pytest.mark.realtime
 def test_the_timeout_can_be_changed(watchdog):
     (answer,) = watchdog.set_parameters("/command_watchdog", timeout=0.4)
     assert answer.successful, answer.reason

@@ -49,6 +49,8 @@ def test_timing_gives_mean_rate_and_largest_deviation(periods):
     assert summary["jitter_ms"] == pytest.approx(1e3 * max(abs(p - mean) for p in periods), rel=1e-6, abs=0.002)
 
 
+@pytest.mark.slow
+@pytest.mark.realtime
 def test_diagnostics_come_every_second_and_with_every_change(loop, policy_path):
     loop.rest()
     seen = len(loop.diagnostics)
@@ -88,6 +90,7 @@ def test_diagnostics_come_every_second_and_with_every_change(loop, policy_path):
     assert (status.name, status.hardware_id) == ("inference_node: arm", "planar_arm")
 
 
+@pytest.mark.realtime
 @pytest.mark.slow
 def test_with_the_joint_state_as_trigger_commands_answer_states(policy_path):
     with closed_loop(policy_path, rate=80.0, trigger="joint_state", goal=[-0.3, -0.2]) as loop:

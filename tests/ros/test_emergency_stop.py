@@ -50,6 +50,8 @@ def stays_stopped(loop, since: float) -> None:
     assert (late["state"][0][1], late["estopped"][0][1]) == ("estop", True)
 
 
+@pytest.mark.slow
+@pytest.mark.realtime
 def test_the_service_stops_the_arm_at_once_and_for_good(loop):
     for _ in range(5):
         loop.start()
@@ -61,6 +63,7 @@ def test_the_service_stops_the_arm_at_once_and_for_good(loop):
     stays_stopped(loop, since)
 
 
+@pytest.mark.realtime
 @pytest.mark.parametrize("profile", PROFILES.values(), ids=PROFILES)
 def test_a_false_that_follows_at_once_does_not_undo_it(loop, profile):
     other = loop.peer.publisher(Bool, "/emergency_stop", PROFILES["reliable"])
@@ -75,6 +78,7 @@ def test_a_false_that_follows_at_once_does_not_undo_it(loop, profile):
         loop.peer.wait_state("estop")
 
 
+@pytest.mark.realtime
 @pytest.mark.parametrize("profile", PROFILES.values(), ids=PROFILES)
 def test_a_message_of_every_quality_of_service_stops_the_arm_at_once(loop, profile):
     loop.start()
@@ -84,6 +88,7 @@ def test_a_message_of_every_quality_of_service_stops_the_arm_at_once(loop, profi
     stays_stopped(loop, since)
 
 
+@pytest.mark.slow
 def test_only_a_reset_ends_it_and_the_goal_is_forgotten(loop):
     since = loop.start()
     loop.peer.call("/inference_node/estop")
@@ -99,6 +104,7 @@ def test_only_a_reset_ends_it_and_the_goal_is_forgotten(loop):
     loop.peer.moved(after=since)
 
 
+@pytest.mark.realtime
 def test_false_neither_stops_the_arm_nor_ends_a_stop(loop):
     since = loop.start()
     for profile in PROFILES.values():
@@ -113,6 +119,7 @@ def test_false_neither_stops_the_arm_nor_ends_a_stop(loop):
     assert loop.peer.states[-1][1] == "estop"
 
 
+@pytest.mark.slow
 def test_one_that_was_pressed_before_the_node_started_counts(policy_path, peer):
     peer.publisher(Bool, "/emergency_stop", PROFILES["latched"]).publish(Bool(data=True))
     with closed_loop(policy_path, peer=peer, goal="[-0.3, -0.2]") as loop:

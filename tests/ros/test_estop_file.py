@@ -72,6 +72,7 @@ def test_where_nothing_can_be_written_it_says_so(monkeypatch, tmp_path):
     assert closed(EmergencyStopFile(NODE, 7)).unusable == f"{tmp_path / 'file' / 'physai'}: Not a directory"
 
 
+@pytest.mark.realtime
 def test_a_disk_that_refuses_is_told_of_and_asked_again(home):
     file = EmergencyStopFile(NODE, 7)
     home.rmdir()
@@ -102,6 +103,7 @@ def test_a_change_that_half_succeeded_is_made_again(home, monkeypatch):
     assert file.path.exists()
 
 
+@pytest.mark.realtime
 def test_a_disk_that_stands_still_keeps_nobody_waiting(home, monkeypatch):
     file, go = EmergencyStopFile(NODE, 7), threading.Event()
     monkeypatch.setattr("os.fsync", lambda _: go.wait(10.0))
@@ -114,6 +116,7 @@ def test_a_disk_that_stands_still_keeps_nobody_waiting(home, monkeypatch):
     go.set()
 
 
+@pytest.mark.slow
 @pytest.mark.fault("emergency stop, then killed and started again")
 def test_a_node_killed_in_an_emergency_stop_is_in_it_when_it_starts_again(policy_path, peer, tmp_path):
     with closed_loop(policy_path, peer=peer, state=tmp_path, goal=list(FAR)) as loop:
@@ -141,6 +144,7 @@ def test_a_node_killed_in_an_emergency_stop_is_in_it_when_it_starts_again(policy
     assert list((tmp_path / "physai").iterdir()) == []
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not os.path.exists("/proc/self/status"), reason="needs a folder that even root cannot write to")
 @pytest.mark.fault("the folder for that cannot be written")
 def test_without_a_place_to_remember_it_a_node_does_not_start_by_itself(policy_path):

@@ -18,6 +18,8 @@ BAD = {
 }
 
 
+@pytest.mark.slow
+@pytest.mark.realtime
 @pytest.mark.parametrize("name", BAD)
 def test_a_bad_goal_is_refused_with_a_reason_and_the_old_one_stays(loop, name):
     goal, reason = BAD[name]
@@ -30,6 +32,7 @@ def test_a_bad_goal_is_refused_with_a_reason_and_the_old_one_stays(loop, name):
     assert loop.diagnosis()[2]["goal"] == str(list(FAR))
 
 
+@pytest.mark.slow
 def test_a_bad_goal_does_not_start_the_arm(loop):
     loop.rest()
     since = time.monotonic()
@@ -52,12 +55,14 @@ def test_a_goal_out_of_reach_is_moved_to_the_nearest_where_that_is_allowed(loop)
         loop.peer.set_parameters("/inference_node", unreachable_goal="reject")
 
 
+@pytest.mark.slow
 def test_a_goal_given_as_parameter_is_moved_into_reach_too(policy_path):
     with closed_loop(policy_path, goal=[-3.0, 0.0], unreachable_goal="project") as loop:
         loop.peer.moved()
         assert loop.diagnosis()[2]["goal"] == "[-0.53, 0.0]"
 
 
+@pytest.mark.slow
 def test_only_the_last_of_many_goals_counts(loop):
     loop.rest()
     for angle in range(0, 360, 10):

@@ -105,6 +105,8 @@ COUNTED = {
 }
 
 
+@pytest.mark.slow
+@pytest.mark.realtime
 @pytest.mark.parametrize("change", GOOD.values(), ids=GOOD)
 def test_the_arm_moves_on(loop, change):
     loop.rest()
@@ -114,6 +116,7 @@ def test_the_arm_moves_on(loop, change):
     assert loop.peer.states[-1][1] == "active"
 
 
+@pytest.mark.realtime
 @pytest.mark.parametrize("name", BAD)
 def test_the_arm_stops_counts_and_goes_on_by_itself(loop, name):
     loop.peer.set_parameters("/inference_node", resume_timeout=10.0)  # a busy machine may take its time
@@ -133,6 +136,7 @@ def test_the_arm_stops_counts_and_goes_on_by_itself(loop, name):
     assert loop.peer.wait_state("active")
 
 
+@pytest.mark.realtime
 @pytest.mark.parametrize(
     "change", [BAD["velocity missing"], BAD["velocity NaN"]], ids=["missing velocities", "NaN velocities"]
 )
@@ -148,6 +152,7 @@ def test_are_estimated_where_that_is_allowed(loop, change):
         loop.peer.set_parameters("/inference_node", allow_velocity_estimate=False)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "profile", [qos.SENSOR, QoSProfile(depth=10), qos.LATCHED], ids=["best effort", "reliable", "latched"]
 )
@@ -158,6 +163,7 @@ def test_of_every_quality_of_service_are_heard(loop, profile):
     loop.peer.moved(after=since, commands=30)
 
 
+@pytest.mark.slow
 def test_of_a_joint_that_counts_from_minus_pi_to_pi_lead_around_the_corner(policy_path):
     with closed_loop(policy_path, max_velocity=1.0, limit_margin=0.2) as loop:
         loop.arm.HOME = (-2.8, 0.8)
@@ -173,6 +179,7 @@ def test_of_a_joint_that_counts_from_minus_pi_to_pi_lead_around_the_corner(polic
         assert "holds: position jump" not in str(loop.diagnosis())
 
 
+@pytest.mark.realtime
 def test_that_jump_stop_the_arm_until_they_agree(loop):
     loop.start()
     since = loop.arm.sent[-1]
@@ -242,6 +249,7 @@ def gripper(loop, rate):
         loop.peer.node.destroy_publisher(publisher)
 
 
+@pytest.mark.realtime
 @pytest.mark.parametrize("rate", [50, 200])  # at 1,000 Hz, this process would be busy with them, too
 def test_of_an_arm_beside_a_gripper_move_it_as_if_it_were_alone(loop, rate):
     with gripper(loop, rate):
@@ -253,6 +261,8 @@ def test_of_an_arm_beside_a_gripper_move_it_as_if_it_were_alone(loop, rate):
     assert int(counters["count: states of other joints"]) > 1.5 * rate
 
 
+@pytest.mark.slow
+@pytest.mark.realtime
 def test_with_every_joint_in_a_message_of_its_own_lead_to_the_goals(policy_path):
     def apart(arm):
         def change(message):
@@ -274,6 +284,7 @@ def test_with_every_joint_in_a_message_of_its_own_lead_to_the_goals(policy_path)
         assert "count: holds: state old" not in loop.diagnosis()[2]
 
 
+@pytest.mark.slow
 @pytest.mark.fault("two publishers claim the same joint")
 def test_of_two_publishers_that_claim_a_joint_are_a_reason_to_wait_that_names_both(loop):
     loop.start()
@@ -291,6 +302,7 @@ def test_of_two_publishers_that_claim_a_joint_are_a_reason_to_wait_that_names_bo
     loop.peer.all_zeros(after=since + WITHIN, commands=20)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("as_another", [False, True], ids=["by the same publisher", "by another"])
 def test_that_come_again_after_three_seconds_move_nothing_before_a_new_goal(loop, as_another):
     loop.peer.set_parameters("/inference_node", resume_timeout=1.0)
@@ -310,6 +322,7 @@ def test_that_come_again_after_three_seconds_move_nothing_before_a_new_goal(loop
     loop.start_from_here()
 
 
+@pytest.mark.realtime
 def test_that_come_again_after_half_a_second_move_the_arm_on(loop):
     loop.peer.set_parameters("/inference_node", resume_timeout=1.0)
     loop.start()

@@ -18,12 +18,13 @@ import signal
 from pathlib import Path
 
 from tests.ros.loop import closed_loop
-from tests.ros.peer import mapped_segments
+from tests.ros.peer import mapped_segments, node_command
 
 
 def test_fails_with_nodes_that_run(start, peer):
     policy = os.environ["POLICY"]
-    nodes = [start("virtual_robot"), start("inference_node", policy_path=policy, autostart=True, goal=[-0.3, -0.2])]
+    inference_node = node_command("inference_node", policy_path=policy, autostart=True, goal=[-0.3, -0.2])
+    nodes = [start.run(node_command("virtual_robot")), start.run(inference_node)]
     with closed_loop(policy, goal=[-0.3, -0.2]) as loop:
         peer.moved()
         loop.peer.moved()

@@ -31,6 +31,7 @@ def speeds(peer, after):
     return [(at, max(map(abs, message.velocity))) for at, message in list(peer.joint_states) if at > after]
 
 
+@pytest.mark.realtime
 @pytest.mark.slow
 def test_a_robot_that_stands_still_and_one_that_dies(driven, start, peer):
     robot, _ = driven()
@@ -59,6 +60,7 @@ def test_a_robot_that_stands_still_and_one_that_dies(driven, start, peer):
     peer.moved(after=time.monotonic(), commands=20)
 
 
+@pytest.mark.realtime
 @pytest.mark.slow
 def test_a_node_that_stood_still_sends_zeros_first_and_no_burst(driven, peer):
     _, node = driven(resume_timeout=10.0)
@@ -85,6 +87,7 @@ def test_after_a_killed_node_a_faithful_robot_moves_on_and_on(driven, peer):
     assert min(speed for _, speed in speeds(peer, since)) > 0.01
 
 
+@pytest.mark.realtime
 @pytest.mark.slow
 @pytest.mark.parametrize("timeout", [0.1, 0.3])
 def test_a_watchdog_between_stops_the_arm_of_a_killed_node(driven, start, peer, timeout):
@@ -98,6 +101,7 @@ def test_a_watchdog_between_stops_the_arm_of_a_killed_node(driven, start, peer, 
     peer.all_zeros(after=since + took, commands=20)
 
 
+@pytest.mark.realtime
 @pytest.mark.slow
 def test_a_robot_with_a_command_timeout_stops_without_its_node(driven, peer):
     _, node = driven(robot={"command_timeout": 0.2})
@@ -108,6 +112,8 @@ def test_a_robot_with_a_command_timeout_stops_without_its_node(driven, peer):
     assert 0.15 < stands - last < 0.3
 
 
+@pytest.mark.slow
+@pytest.mark.realtime
 def test_a_paused_robot_of_this_process_stops_the_arm_within_the_timeout(policy_path):
     with closed_loop(policy_path, goal=list(FAR)) as loop:
         for _ in range(10):

@@ -81,6 +81,7 @@ def talk(lines: int, folder: Path, wait: float, **streams: int) -> tuple[subproc
     return subprocess.Popen([sys.executable, "-c", code], **streams), report
 
 
+@pytest.mark.realtime
 def test_lines_that_nobody_takes_are_counted_and_told_of_when_they_flow_again(tmp_path):
     reader, writer = os.pipe()
     process, report = talk(3000, tmp_path, 1.0, stdout=writer, stderr=writer)
@@ -110,6 +111,7 @@ def test_a_full_disk_and_a_reader_that_has_gone_lose_lines_and_nothing_else(tmp_
     assert float(report.read_text().split()[1]) > 40
 
 
+@pytest.mark.realtime
 def test_an_end_waits_half_a_second_for_output_that_does_not_flow(tmp_path):
     with unread_pipe(tmp_path) as path, open(path, "r+b", buffering=0) as pipe:
         process, report = talk(10, tmp_path, 0.0, stdout=pipe, stderr=pipe)
@@ -119,6 +121,8 @@ def test_an_end_waits_half_a_second_for_output_that_does_not_flow(tmp_path):
         assert time.monotonic() - since < 1.5
 
 
+@pytest.mark.slow
+@pytest.mark.realtime
 @pytest.mark.parametrize(
     ("kind", "reasons"),
     [
@@ -158,6 +162,7 @@ def test_a_node_stops_the_arm_all_the_same(policy_path, tmp_path, kind, reasons)
         assert time.monotonic() - since < 4.0
 
 
+@pytest.mark.realtime
 @pytest.mark.parametrize("kind", ["terminal", "pipe"])
 @pytest.mark.fault("output stopped, full or closed")
 def test_a_watchdog_stops_the_arm_all_the_same(tmp_path, kind):
@@ -174,6 +179,7 @@ def test_a_watchdog_stops_the_arm_all_the_same(tmp_path, kind):
             peer.close()
 
 
+@pytest.mark.slow
 def test_a_recorder_goes_on_recording(tmp_path):
     bag = tmp_path / "bag"
     with blocked("terminal", tmp_path) as output, free_domain() as domain:
@@ -189,6 +195,7 @@ def test_a_recorder_goes_on_recording(tmp_path):
     assert numbers(bag) == list(range(300))
 
 
+@pytest.mark.slow
 @pytest.mark.fault("output stopped, full or closed")
 def test_a_closed_error_output_is_no_socket_of_the_middleware(start, peer, policy_path):
     command = shlex.join(node_command("inference_node", policy_path=policy_path, autostart=True, goal=list(FAR)))

@@ -156,6 +156,8 @@ def test_every_parameter_is_described_and_has_a_line_of_help(kind):
     assert "(rad/s, 0.001 to 100)" in help_text(ControllerConfig)
 
 
+@pytest.mark.slow
+@pytest.mark.realtime
 def test_a_lower_velocity_takes_effect_at_once_while_the_arm_moves(loop):
     loop.start()
     try:
@@ -174,6 +176,7 @@ def test_a_lower_velocity_takes_effect_at_once_while_the_arm_moves(loop):
         loop.peer.set_parameters(NODE, max_velocity=0.3)
 
 
+@pytest.mark.realtime
 def test_bad_and_fixed_values_are_refused_while_the_arm_moves_and_change_nothing(loop):
     since = loop.start()
     answers = loop.peer.set_parameters(

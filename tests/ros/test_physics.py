@@ -68,6 +68,8 @@ def zeros_last(peer):
     return peer.commands and not any(peer.commands[-1][1])
 
 
+@pytest.mark.slow
+@pytest.mark.realtime
 def test_steps_take_a_control_period_and_do_not_drift(start_robot, connect):
     start_robot()
     physics = connect()
@@ -82,6 +84,8 @@ def test_steps_take_a_control_period_and_do_not_drift(start_robot, connect):
     assert periods.mean() == pytest.approx(20.0, abs=1.0)
 
 
+@pytest.mark.slow
+@pytest.mark.realtime
 def test_a_caller_who_is_late_gets_whole_periods_again(start_robot, connect):
     start_robot()
     physics = connect()
@@ -94,6 +98,8 @@ def test_a_caller_who_is_late_gets_whole_periods_again(start_robot, connect):
         assert time.monotonic() - before >= periods * DT
 
 
+@pytest.mark.slow
+@pytest.mark.realtime
 def test_joints_are_mapped_by_name_and_others_ignored(start_robot, connect):
     start_robot("-p", "state_joints:=[gripper, joint2, joint1]")
     physics = connect()
@@ -104,6 +110,8 @@ def test_joints_are_mapped_by_name_and_others_ignored(start_robot, connect):
     np.testing.assert_allclose(qd[0], [0.5, -0.25], atol=0.02)
 
 
+@pytest.mark.slow
+@pytest.mark.realtime
 def test_the_reset_service_puts_a_virtual_robot_home_at_once(start_robot, connect):
     start_robot()
     physics = connect()
@@ -114,6 +122,7 @@ def test_the_reset_service_puts_a_virtual_robot_home_at_once(start_robot, connec
     np.testing.assert_allclose(physics.robot_state().joint_position, 0.0, atol=0.02)
 
 
+@pytest.mark.slow
 def test_a_robot_without_the_service_is_driven_home_and_stands_there(start_robot, connect, peer):
     start_robot("-r", "__node:=arm")
     physics = connect(homing_speed=1.0)
@@ -128,6 +137,7 @@ def test_a_robot_without_the_service_is_driven_home_and_stands_there(start_robot
     assert not sent[-1].any()
 
 
+@pytest.mark.slow
 def test_a_continuous_joint_goes_the_shorter_way_around(start_robot, connect):
     start_robot("-r", "__node:=arm")
     physics = connect()
@@ -145,6 +155,8 @@ def test_an_arm_that_does_not_get_to_its_start_is_named(start_robot, connect, pe
     wait_for(lambda: zeros_last(peer))
 
 
+@pytest.mark.slow
+@pytest.mark.realtime
 def test_a_robot_that_falls_silent_is_stopped_and_can_be_used_again(start_robot, connect, peer):
     robot = start_robot()
     physics = connect()
@@ -162,6 +174,7 @@ def test_a_robot_that_falls_silent_is_stopped_and_can_be_used_again(start_robot,
     np.testing.assert_allclose(q, 0.25, atol=0.05)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("fault", "healthy", "reason"),
     [
@@ -183,6 +196,7 @@ def test_states_that_cannot_be_used_end_in_zeros_and_an_error(start_robot, conne
     assert np.isfinite(move(physics, [0.5, 0.5], 2)).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("options", "reason"),
     [
@@ -196,11 +210,13 @@ def test_a_robot_that_cannot_be_driven_is_refused(start_robot, connect, options,
         connect()
 
 
+@pytest.mark.slow
 def test_where_there_is_no_robot_one_line_says_so(connect):
     with pytest.raises(RobotError, match=r"^no joint state came on /joint_states within 5 s$"):
         connect()
 
 
+@pytest.mark.slow
 def test_a_robot_that_another_one_commands_is_left_alone(start_robot, connect, peer):
     start_robot()
     peer.publisher(Float64MultiArray, TOPIC)
@@ -209,6 +225,7 @@ def test_a_robot_that_another_one_commands_is_left_alone(start_robot, connect, p
     assert peer.commands == []
 
 
+@pytest.mark.slow
 def test_a_rival_who_comes_later_ends_the_episode_with_zeros(start_robot, connect, peer):
     start_robot()
     physics = connect()
@@ -222,6 +239,8 @@ def test_a_rival_who_comes_later_ends_the_episode_with_zeros(start_robot, connec
     move(physics, [0.5, 0.5], 2)
 
 
+@pytest.mark.slow
+@pytest.mark.realtime
 def test_an_arm_whose_caller_pauses_is_stopped(start_robot, connect, peer):
     start_robot()
     physics = connect()
@@ -232,6 +251,7 @@ def test_an_arm_whose_caller_pauses_is_stopped(start_robot, connect, peer):
     move(physics, [0.5, 0.5], 5)
 
 
+@pytest.mark.slow
 def test_an_arm_whose_physics_is_forgotten_is_stopped(start_robot, connect, spec, peer):
     start_robot()
     connect().close()  # it sets the domain
@@ -243,6 +263,7 @@ def test_an_arm_whose_physics_is_forgotten_is_stopped(start_robot, connect, spec
     wait_for(lambda: peer.node.count_publishers(TOPIC) == 0, what="its publisher is gone")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("end", ["", "raise RuntimeError('a bug')", "os.kill(os.getpid(), signal.SIGINT)"])
 def test_a_program_that_ends_in_any_way_leaves_a_standing_arm(start, start_robot, peer, end):
     start_robot()
@@ -262,6 +283,7 @@ for _ in range(10):
     assert [any(command) for _, command in peer.commands[-3:]] == [False] * 3, program.output
 
 
+@pytest.mark.slow
 def test_what_a_robot_behind_ros_cannot_do_is_refused_in_one_line(start_robot, connect, spec, peer):
     with pytest.raises(UserError, match="there is one robot behind ROS, not 2"):
         connect(robots=2)
@@ -283,6 +305,8 @@ def test_what_a_robot_behind_ros_cannot_do_is_refused_in_one_line(start_robot, c
     physics.close()
 
 
+@pytest.mark.slow
+@pytest.mark.realtime
 def test_topics_can_have_other_names(start_robot, connect):
     start_robot("-r", "/joint_states:=/left/joint_states", "-r", f"{TOPIC}:=/left/commands")
     physics = connect(remap=["/joint_states:=/left/joint_states", f"{TOPIC}:=/left/commands"])

@@ -41,6 +41,7 @@ def run(domain):
         node.end()
 
 
+@pytest.mark.slow
 def test_an_arm_that_was_never_heard_of_is_told_nothing_by_a_stop_or_an_end(listener, run, position_run):
     node = run("inference_node", policy_path=position_run / "policy.pt", autostart=True)
     wait_for(lambda: listener.states, what="the node")
@@ -53,6 +54,7 @@ def test_an_arm_that_was_never_heard_of_is_told_nothing_by_a_stop_or_an_end(list
     assert listener.targets == []
 
 
+@pytest.mark.slow
 def test_an_end_while_the_arm_moves_leaves_it_where_it_is(listener, run, position_run):
     run("virtual_robot", **ARM)
     node = run("inference_node", policy_path=position_run / "policy.pt", autostart=True, max_velocity=0.5)

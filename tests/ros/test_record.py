@@ -62,6 +62,8 @@ def start_recorder(start, folder: Path, *topics: str):
     return recorder
 
 
+@pytest.mark.slow
+@pytest.mark.realtime
 @pytest.mark.parametrize(
     ("kind", "end"),
     [
@@ -84,6 +86,8 @@ def test_every_message_is_there_once(start, peer, tmp_path, kind, end):
     assert recorder.says(f"recorded to {tmp_path / 'bag'}")
 
 
+@pytest.mark.slow
+@pytest.mark.realtime
 def test_publishers_of_all_kinds_share_a_topic(start, peer, tmp_path):
     early = peer.publisher(UInt64, "/numbers", KINDS["latched"])
     for number in range(10):
@@ -105,6 +109,8 @@ def same_end(some: list, others: list) -> bool:
     return length > 0 and some[-length:] == others[-length:]
 
 
+@pytest.mark.slow
+@pytest.mark.realtime
 def test_a_session_is_recorded_as_it_was(start, peer, policy_path, tmp_path):
     estopped, joint_states = [], []
     peer.listen(Bool, "/inference_node/estopped", estopped, KINDS["latched"], lambda message: message.data)
@@ -163,6 +169,8 @@ def test_a_session_is_recorded_as_it_was(start, peer, policy_path, tmp_path):
             assert 0 <= len(data) - len(TYPES.serialize_cdr(message, connection.msgtype)) < 4
 
 
+@pytest.mark.slow
+@pytest.mark.realtime
 def test_a_killed_recording_is_completed(start, peer, tmp_path):
     bag = tmp_path / "bag"
     recorder = start_recorder(start, bag, "/numbers", "/joint_states")
@@ -205,6 +213,7 @@ def test_a_full_disk_ends_a_recording_in_one_line(start, peer, tmp_path):
     assert all(message.data == "x" * 10_000 for _, message in read(bag, "/text", String))
 
 
+@pytest.mark.slow
 def test_what_cannot_be_recorded_is_named_and_left_out(start, peer, tmp_path):
     hidden = "import sys; sys.modules['stereo_msgs.msg'] = None; from physai.ros.record import main; sys.exit(main())"
     parameters = ["-p", f"output:={tmp_path / 'bag'}", "-p", "topics:=[/disparity, /goals, /numbers]"]
@@ -221,6 +230,7 @@ def test_what_cannot_be_recorded_is_named_and_left_out(start, peer, tmp_path):
     assert recorder.output.count("is not recorded") == 2
 
 
+@pytest.mark.slow
 def test_it_ends_by_itself(start, tmp_path):
     recorder = start("record", output=tmp_path / "bag", duration=0.5, topics="[relative/name]")
     assert recorder.wait() == 0
@@ -229,6 +239,7 @@ def test_it_ends_by_itself(start, tmp_path):
         assert reader.message_count == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("parameters", "line"),
     [
@@ -249,6 +260,7 @@ def test_bad_input_is_one_line(start, parameters, line):
     assert len(recorder.lines) == 1
 
 
+@pytest.mark.slow
 def test_every_cut_of_a_recording_is_completed(tmp_path):
     """As a power cut leaves it: the file ends anywhere."""
     bag = Bag(tmp_path / "bag")

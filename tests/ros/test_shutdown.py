@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from tests.ros.loop import closed_loop
-from tests.ros.peer import TOPIC, Peer, wait_for
+from tests.ros.peer import TOPIC, Peer, node_command, wait_for
 
 GOAL = "[-0.3, -0.2]"
 ENDS = {
@@ -49,6 +49,7 @@ def test_the_last_command_is_zero_five_times_of_five(policy_path, end, code):
             assert loop.node.output.count("Traceback") == code
 
 
+@pytest.mark.slow
 def test_the_last_command_is_zero(policy_path):
     with contextlib.ExitStack() as stack:
         loops = {name: stack.enter_context(closed_loop(policy_path, rate=50.0, goal=GOAL)) for name in ENDS}
@@ -71,6 +72,7 @@ def test_a_node_that_never_had_a_say_ends_without_a_word(policy_path):
         assert loop.peer.commands == []
 
 
+@pytest.mark.slow
 @pytest.mark.fault("Ctrl-C, Ctrl-Z, or any number of signals")
 def test_a_storm_of_signals_ends_it_as_one_does(policy_path):
     with closed_loop(policy_path, goal=GOAL) as loop:
@@ -86,7 +88,7 @@ def test_a_storm_of_signals_ends_it_as_one_does(policy_path):
 
 @pytest.mark.parametrize("library", ["librcl.so", "libtorch_cpu.so", "librmw_fastrtps_cpp.so"])
 def test_a_signal_before_it_is_up_ends_it_without_a_traceback(start, policy_path, library):
-    process = start("inference_node", policy_path=policy_path)
+    process = start.run(node_command("inference_node", policy_path=policy_path))
     wait_for(lambda: library in Path(f"/proc/{process.pid}/maps").read_text(), what=library)
     process.signal(signal.SIGINT)
     assert process.wait() in (0, -signal.SIGINT)

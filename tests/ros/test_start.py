@@ -103,6 +103,8 @@ def test_bad_parameters_are_refused(files, refused, policy_path):
     )
 
 
+@pytest.mark.slow
+@pytest.mark.realtime
 def test_whole_numbers_are_taken_for_floats_and_misspelt_names_warn_with_the_nearest(policy_path, tmp_path):
     file = tmp_path / "robot.yaml"
     file.write_text("inference_node:\n  ros__parameters:\n    max_velocty: 0.1\n    max_acceleration: 3\n    xyz: 1\n")
@@ -120,6 +122,7 @@ def test_whole_numbers_are_taken_for_floats_and_misspelt_names_warn_with_the_nea
         wait_for(lambda: 95 < rate() < 105, 10.0, "100 commands a second")  # when this process is not busy itself
 
 
+@pytest.mark.slow
 @pytest.mark.fault("`ROS_DOMAIN_ID` that is none, empty `policy_sha256`, `watchdog` that is no name")
 def test_a_domain_that_there_is_not_is_refused_in_one_line(start, policy_path):
     commands = {"inference_node": [], "demo": [f"policy_path={policy_path}"]}

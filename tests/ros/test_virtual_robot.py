@@ -7,8 +7,9 @@ from array import array
 import pytest
 from std_msgs.msg import Float64MultiArray
 
+from tests.ros.forge import forged
 from tests.ros.loop import FAR
-from tests.ros.peer import TOPIC, Peer, Process, free_domain, node_command, wait_for
+from tests.ros.peer import TOPIC, Peer, free_domain, wait_for
 
 NODE = "/virtual_robot"
 
@@ -18,7 +19,7 @@ class Robot:
 
     def __init__(self, domain: int, **parameters) -> None:
         self.peer = Peer(domain)
-        self.process = Process(node_command("virtual_robot", **parameters), domain)
+        self.process = forged("virtual_robot", domain, **parameters)
         commands = self.peer.publisher(Float64MultiArray, TOPIC, 1)
         # The peer listens, too.
         wait_for(lambda: commands.get_subscription_count() == 2 and self.peer.joint_states, what="the robot")
@@ -103,6 +104,7 @@ def test_a_command_of_a_wrong_length_makes_it_deaf_until_a_reset(robot):
     robot.settles_at(0.3, 0.3)
 
 
+@pytest.mark.realtime
 def test_states_come_a_hundred_times_a_second_in_order(robot):
     since = time.monotonic()
     wait_for(lambda: robot.peer.joint_states[-1][0] > since + 2.0)
@@ -120,6 +122,8 @@ def test_a_command_timeout_can_be_set_while_it_moves(robot):
     robot.settles_at(0.0, 0.0)
 
 
+@pytest.mark.slow
+@pytest.mark.realtime
 def test_each_fault_can_be_switched_on_and_off_while_it_runs(robot):
     def seen(count: int = 60):
         robot.state()
@@ -162,6 +166,7 @@ def test_joints_are_commanded_and_shown_in_the_order_that_is_asked_for(other):
     assert (message.position[0], message.position[2]) == (0.0, 0.0)
 
 
+@pytest.mark.realtime
 @pytest.mark.slow
 def test_the_inference_node_lives_with_faults_that_leave_enough_and_stops_for_the_others(start, peer, policy_path):
     # No other joint in the states: a NaN there would spoil nothing, and five good states in a row end a hold.

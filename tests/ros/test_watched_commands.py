@@ -40,6 +40,8 @@ def drive(watched):
     return watched.loop.start_from_here()
 
 
+@pytest.mark.slow
+@pytest.mark.realtime
 @pytest.mark.parametrize("number", [signal.SIGSTOP, signal.SIGKILL])
 @pytest.mark.fault("watchdog silent for `watchdog_timeout` (0.1 s)")
 def test_the_node_stops_the_arm_of_a_watchdog_that_hangs_or_dies_and_goes_on_when_it_is_back(watched, number):
@@ -64,6 +66,7 @@ def test_the_node_stops_the_arm_of_a_watchdog_that_hangs_or_dies_and_goes_on_whe
     assert max(map(abs, first)) <= 0.05  # two periods of the acceleration limit at most
 
 
+@pytest.mark.realtime
 @pytest.mark.fault("node silent for the watchdog's `timeout` (0.1 s)")
 def test_the_watchdog_stops_the_arm_of_a_node_that_hangs(watched):
     drive(watched)
@@ -78,6 +81,7 @@ def test_the_watchdog_stops_the_arm_of_a_node_that_hangs(watched):
     watched.peer.moved(after=time.monotonic())
 
 
+@pytest.mark.slow
 @pytest.mark.fault("another publisher of commands")
 def test_a_third_commander_is_a_rival_of_both(watched):
     drive(watched)
@@ -107,6 +111,8 @@ def test_another_commander_of_the_watchdog_is_a_rival_of_the_node(watched):
     watched.peer.node.destroy_publisher(rival)
 
 
+@pytest.mark.slow
+@pytest.mark.realtime
 def test_a_node_whose_watchdog_never_came_waits_without_a_word(policy_path):
     with closed_loop(policy_path, watchdog=NAME, goal=list(FAR)) as loop:
         wait_for(lambda: SILENT in loop.diagnosis()[1])
@@ -117,6 +123,7 @@ def test_a_node_whose_watchdog_never_came_waits_without_a_word(policy_path):
         assert loop.peer.first_zeros(after=since) < WITHIN
 
 
+@pytest.mark.slow
 def test_its_end_leaves_the_arm_standing_also_when_the_watchdog_has_just_stopped(policy_path):
     with closed_loop(policy_path, watchdog=NAME, goal=list(FAR)) as loop:
         watchdog = forged("command_watchdog", loop.peer.domain, joints=2)

@@ -171,3 +171,12 @@ class NoTask:
     """Takes what a task takes."""
 
     def __init__(self, *_: object) -> None: ...
+
+
+def test_what_a_task_returns_stays_the_tasks_own(simulation):
+    kept = np.ones(4, bool)
+    simulation.task.success = lambda step: kept
+    simulation.task.terminated = lambda step, success: kept
+    simulation.step(np.zeros((4, 2)), restart=np.array([True, False, False, False]))
+    assert kept.all()
+    assert simulation.success[:, 0].tolist() == [False, True, True, True]

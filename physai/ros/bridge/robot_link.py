@@ -59,7 +59,7 @@ class RobotLink:
                 signal_handler_options=SignalHandlerOptions.NO,
             )
         except RuntimeError as error:  # RCLError
-            raise UserError(brief(error)) from None
+            raise UserError(brief(error)) from error
         self._node = Node("physai_env", context=self._context, start_parameter_services=False, enable_rosout=False)
         self._news = threading.Condition()  # also guards what goes out
         self._received, self._stamp, self._refused = -math.inf, -1, ""

@@ -129,8 +129,8 @@ def _copy_whole_records(torn: Path, whole: Path) -> None:
     with torn.open("rb") as source, whole.open("wb") as target:
         try:
             fcntl.flock(source, fcntl.LOCK_SH | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise UserError(f"{torn.parent} is still being recorded") from None
+        except BlockingIOError as error:
+            raise UserError(f"{torn.parent} is still being recorded") from error
         size = os.fstat(source.fileno()).st_size
         target.write(source.read(len(_MAGIC)))
         while len(head := source.read(9)) == 9:

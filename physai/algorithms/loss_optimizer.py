@@ -35,7 +35,7 @@ def check_ranges(where: str, module: nn.Module) -> None:
             raise UserError(f"{where}.{name}: must be between {low:g} and {high:g}, got {float(value):g}")
 
 
-class Descent:
+class LossOptimizer:
     """Follows the gradient of the sum of a loss module's ``loss_*`` outputs.
 
     Args:
