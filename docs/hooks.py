@@ -13,7 +13,7 @@ from typing import Any
 
 import yaml
 
-from physai.config import conf_dir
+from physai.compose import conf_dir
 from physai.deploy.parameters import Parameters
 
 PARAMETERS = {

@@ -1,23 +1,11 @@
-"""Composing and checking configuration: values live in ``conf/``, types and ranges in models that inherit Config."""
+"""Checking configuration: values live in ``conf/``, types and ranges in models that inherit Config."""
 
-import contextlib
 import difflib
-import functools
 import importlib.metadata
-import os
 import re
-from collections.abc import Iterable, Iterator
-from pathlib import Path
+from collections.abc import Iterable
 from typing import Annotated, Any, TypeVar
 
-from hydra import compose as hydra_compose
-from hydra import initialize_config_dir
-from hydra.core.config_loader import ConfigLoader
-from hydra.core.config_store import ConfigStore
-from hydra.core.global_hydra import GlobalHydra
-from hydra.core.plugins import Plugins
-from hydra.errors import HydraException, MissingConfigException, OverrideParseException
-from hydra.plugins.config_source import ConfigLoadError
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
@@ -44,139 +32,6 @@ NonNegativeFloat = Annotated[float, Field(ge=0)]
 
 C = TypeVar("C", bound=Config)
 
-_CPU_MAX = Path("/sys/fs/cgroup/cpu.max")  # of a container: microseconds in each period of so many, or "max"
-
-
-def _ceil_div(number: Any, divisor: Any) -> int:
-    """Resolver ``${ceil_div:a,b}``; nonsense gives 1, for the key that holds it gets the blame when it is validated."""
-    try:
-        return max(1, -(-int(number) // int(divisor)))
-    except (TypeError, ValueError, ZeroDivisionError):
-        return 1
-
-
-def cores() -> int:
-    """How many cores this process may keep busy: those that it may run on, or its container's share of them."""
-    allowed = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    try:
-        quota, period = _CPU_MAX.read_text().split()
-        return max(1, min(allowed, int(quota) // int(period)))
-    except (OSError, ValueError):  # no container, or one without a limit ("max")
-        return allowed
-
-
-def _cores_of_job(threads: int, processes: int, sync: bool) -> int:
-    """Resolver ``${cores_of_job:threads,processes,sync}``: what a run keeps busy; with ``sync``, it takes turns."""
-    return max(1, threads, processes) if sync else threads + processes
-
-
-def _jobs_at_once(threads: int, processes: int, sync: bool) -> int:
-    """Resolver ``${jobs_at_once:threads,processes,sync}``: how many runs this computer's cores are enough for."""
-    return max(1, cores() // _cores_of_job(threads, processes, sync))
-
-
-def _add(number: int, other: int) -> int:
-    """Resolver ``${add:a,b}``."""
-    return number + other
-
-
-def _search_space(algo: str) -> DictConfig:
-    """Resolver ``${search_space:algo}``: what Optuna looks through; nothing for an algorithm without such a file."""
-    path = conf_dir() / "hydra" / "search" / f"{algo}.yaml"
-    return OmegaConf.load(path) if path.is_file() else OmegaConf.create({})
-
-
-for _resolver in (_add, _ceil_div, _cores_of_job, _jobs_at_once, _search_space):
-    OmegaConf.register_new_resolver(_resolver.__name__.lstrip("_"), _resolver)
-
-
-# Hydra copies its sources at each of --help's 130 looks into a config group, and with them this register of all
-# plugins' configs, which hands out copies anyway: more than half of the time of --help.
-ConfigStore.__deepcopy__ = lambda self, _: self  # type: ignore[attr-defined]
-
-
-def jobs_at_once(config: DictConfig) -> int:
-    """How many runs with this config this computer's cores are enough for."""
-    keys = {"threads": 1, "collector.processes": 1, "collector.sync": True}  # not all commands have these
-    return _jobs_at_once(*(OmegaConf.select(config, key, default=value) for key, value in keys.items()))
-
-
-def conf_dir() -> Path:
-    """Return the folder of the YAML files: inside the installed package, or beside it in a checkout."""
-    inside = Path(__file__).parent / "conf"
-    return inside if inside.is_dir() else Path(__file__).parent.parent / "conf"
-
-
-_PLUGINS = {
-    "joblib": "joblib",
-    "submitit_local": "submitit",
-    "submitit_slurm": "submitit",
-    "ray": "ray-launcher",
-    "optuna": "optuna",
-}
-"""Launchers and sweepers of Hydra, and the extra that each comes with."""
-
-
-@functools.cache
-def set_plugin_defaults() -> None:
-    """Give Hydra's launchers and sweepers, those that are installed, the values of ``conf/hydra/defaults``."""
-    Plugins.instance()  # finds them
-    store, folder = ConfigStore.instance(), conf_dir() / "hydra" / "defaults"
-    for path in folder.glob("*/*.yaml"):
-        group = f"hydra/{path.parent.name}"
-        with contextlib.suppress(ConfigLoadError):
-            plugin = store.load(f"{group}/{path.name}")
-            values = {**OmegaConf.to_container(plugin.node), **OmegaConf.to_container(OmegaConf.load(path))}
-            store.store(path.stem, values, group, provider=plugin.provider)
-
-
-@contextlib.contextmanager
-def initialized(name: str) -> Iterator[ConfigLoader]:
-    """Context in which Hydra finds ``conf/``, for the command ``name``; gives what loads configs there."""
-    state = GlobalHydra.instance()
-    running, state.hydra = state.hydra, None  # a job of Hydra's may compose, too
-    try:
-        with initialize_config_dir(str(conf_dir().absolute()), job_name=name, version_base="1.3"):
-            yield state.config_loader()
-    finally:
-        state.hydra = running
-
-
-def compose(name: str, overrides: Iterable[str] = (), hydra: bool = False) -> DictConfig:
-    """Compose ``conf/<name>.yaml`` with Hydra overrides.
-
-    Args:
-        name: A file in ``conf/``, without its ending.
-        overrides: As on the command line, such as ``env=reacher`` or ``algo.optimizer.lr=1e-3``.
-        hydra: Keep the ``hydra`` node.
-
-    Raises:
-        UserError: If an override is no override, or names a group, option or key that does not exist.
-    """
-    overrides = list(overrides)
-    set_plugin_defaults()
-    with initialized(name):
-        try:
-            return hydra_compose(name, overrides, return_hydra_config=hydra)
-        except MissingConfigException as error:
-            wanted = str(error.missing_cfg_file).rpartition("/")[2]
-            if wanted in _PLUGINS:
-                raise UserError(f"{error.missing_cfg_file}: pip install 'physai[{_PLUGINS[wanted]}]'") from None
-            raise UserError(f"{error.missing_cfg_file}: no such config{nearest(wanted, error.options or [])}") from None
-        except OverrideParseException as error:
-            raise UserError(f"'{error.override}' is not an override such as key=value") from None
-        except (HydraException, OmegaConfBaseException) as error:
-            if exists := re.search(r"already at '([^']+)'", str(error)):
-                raise UserError(f"'{exists[1]}' exists already: change it without the +") from None
-            match = re.search(r"Could not (?:override|append to config|delete from config)[^']*'([^'=]+)", str(error))
-            if match is None:
-                match = re.search(r"Key '([^']+)'", str(error))
-            if match is None or not overrides:
-                raise UserError(" ".join(str(error).split())) from None
-            key = match[1].split("@")[0]
-            chosen = [one for one in overrides if (conf_dir() / one.partition("=")[0]).is_dir()]  # env=..., algo=...
-            raise UserError(f"unknown key '{key}'{nearest(key, _keys(hydra_compose(name, chosen)))}") from None
-
 
 def validate(model: type[C], node: DictConfig) -> C:
     """Turn a composed config into its typed model.
@@ -196,8 +51,8 @@ def validate(model: type[C], node: DictConfig) -> C:
         first = error.errors()[0]
         key = ".".join(str(part) for part in first["loc"])
         if first["type"] == "extra_forbidden":
-            keys = [name for name in _keys(node) if name != key and not name.startswith(f"{key}.")]
-            raise UserError(f"unknown key '{key}'{nearest(key, keys)}") from None
+            known = [name for name in keys(node) if name != key and not name.startswith(f"{key}.")]
+            raise UserError(f"unknown key '{key}'{nearest(key, known)}") from None
         if first["type"] == "missing":
             raise UserError(f"{key} is missing") from None
         if first["type"] == "value_error" and isinstance(first["ctx"]["error"], UserError | ValueError):
@@ -227,12 +82,13 @@ def not_installed(module: str) -> str:
     return f"'{module}', which is not installed"
 
 
-def _keys(node: DictConfig, prefix: str = "") -> list[str]:
-    keys = []
+def keys(node: DictConfig, prefix: str = "") -> list[str]:
+    """Return every key of a config with its parents, such as ``algo.optimizer.lr``."""
+    found = []
     for key in node:
-        keys.append(f"{prefix}{key}")
+        found.append(f"{prefix}{key}")
         if not OmegaConf.is_missing(node, key) and isinstance(node._get_node(key), DictConfig):
             child = node._get_node(key)
             if child is not None and not child._is_none():
-                keys += _keys(child, f"{prefix}{key}.")
-    return keys
+                found += keys(child, f"{prefix}{key}.")
+    return found

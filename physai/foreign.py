@@ -13,11 +13,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import yaml
-from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.errors import HydraException
 from omegaconf import OmegaConf
 
-from physai.config import compose
+from physai.compose import compose, parse
 from physai.errors import UserError
 from physai.targets import find, is_dotted, shown
 
@@ -148,8 +146,8 @@ def read_overrides(run_dir: Path) -> list[str]:
         raise UserError(f"{path}: the run's overrides are damaged (they are no list of texts)")
     for one in found:
         try:
-            parsed = OverridesParser.create().parse_override(one)
-        except HydraException as error:
+            (parsed,) = parse([one])
+        except UserError as error:
             raise UserError(f"{path}: {shown(one)} is not an override such as key=value") from error
         if "hydra" in f"{parsed.key_or_group} {parsed.package}":
             raise UserError(f"{path}: {shown(one)} is no business of a run folder")

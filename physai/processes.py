@@ -2,11 +2,14 @@
 
 import contextlib
 import ctypes
+import functools
 import os
+import select
 import signal
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Iterable, Iterator
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)
@@ -39,6 +42,24 @@ def follow(parent: int) -> None:
     for number in SIGNALS:
         signal.signal(number, signal.SIG_IGN)
     die_with(parent)
+
+
+@functools.cache  # a process may run several jobs
+def end_with(starter: int) -> None:
+    """Stop this process, as SIGTERM does, once the one that it works for is gone, which need not be its parent.
+
+    Args:
+        starter: Process id.
+    """
+
+    def watch() -> None:
+        with contextlib.suppress(ProcessLookupError):  # it is gone already
+            select.select([os.pidfd_open(starter)], [], [])  # also ends where nobody has asked how the starter ended
+        os.kill(os.getpid(), signal.SIGTERM)  # a run saves itself
+        time.sleep(20)
+        os._exit(128 + signal.SIGTERM)
+
+    threading.Thread(target=watch, daemon=True).start()
 
 
 @contextlib.contextmanager

@@ -1,14 +1,15 @@
 """``python -m physai.train``: train a policy (see ``--help``)."""
 
+import contextlib
 import gc
 import sys
-from contextlib import closing
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from physai import cli, study
+from physai import cli
 from physai.errors import UserError
 
 if TYPE_CHECKING:
@@ -25,7 +26,7 @@ def main() -> None:
         with cli.guard():
             _resume(Path(resumed[-1].strip("'\"")), others)
     else:
-        with closing(_Training(keep=not _sweeps())) as training:
+        with contextlib.closing(Training(keep=not _sweeps())) as training:
             cli.main("train", training.train, training.check)
 
 
@@ -40,7 +41,7 @@ def _config(node: DictConfig) -> "TrainConfig":
     return validate(TrainConfig, node)
 
 
-class _Training:
+class Training:
     """Builds every part of a run, so that whatever is wrong shows before a run folder exists; then trains with them.
 
     Args:
@@ -52,6 +53,7 @@ class _Training:
         self._agent: Agent | None = None
 
     def check(self, node: DictConfig) -> None:
+        """Build the parts; raises a UserError if one cannot be built."""
         from physai.artifact.module import make_deployable, script
         from physai.training.agent import Agent
 
@@ -64,16 +66,19 @@ class _Training:
             self.close()
 
     def __reduce__(self) -> tuple[type, tuple[()]]:
-        return _Training, ()  # a job in another process builds its own
+        return Training, ()  # a job in another process builds its own
 
-    def train(self, node: DictConfig, run_dir: Path) -> float:
-        """Train; return what a search makes best."""
+    def train(self, node: DictConfig, run_dir: Path) -> None:
+        """Train, and export the best policy."""
+        from physai.training.run import run_training
+
         config = _config(node)
         agent, self._agent = self._agent, None
-        _run(config, run_dir, resume=False, agent=agent)
-        return study.objective(run_dir, config.objective)
+        with _ending(config, run_dir):
+            run_training(config, run_dir, agent=agent)
 
     def close(self) -> None:
+        """Free what ``train`` did not take."""
         if self._agent is not None:
             self._agent.close()
             self._agent = None
@@ -82,8 +87,8 @@ class _Training:
 
 def _resume(run_dir: Path, given: list[str]) -> None:
     from physai import foreign
-    from physai.config import compose
-    from physai.training.run import load_config
+    from physai.compose import compose
+    from physai.training.run import load_config, run_training
 
     if _sweeps():
         raise UserError("resume continues one run; it cannot be swept over")
@@ -98,12 +103,14 @@ def _resume(run_dir: Path, given: list[str]) -> None:
         difference = _first_difference(config.model_dump(), wanted.model_dump())
         if difference:
             raise UserError(f"resume={run_dir}: the run has {difference}; a resumed run keeps its config")
-    _run(config, run_dir, resume=True)
+    with _ending(config, run_dir):
+        run_training(config, run_dir, resume=True)
 
 
 def _allowed(override: str) -> list[str]:
     """Packages in ``allow=[...]``."""
-    from physai.config import Config, PackageName, compose, validate
+    from physai.compose import compose
+    from physai.config import Config, PackageName, validate
 
     class Allowed(Config):
         allow: list[PackageName]
@@ -121,15 +128,15 @@ def _first_difference(run: Any, wanted: Any, key: str = "") -> str | None:
     return None if run == wanted else f"{key}={run}, not {wanted}"
 
 
-def _run(config: "TrainConfig", run_dir: Path, resume: bool, agent: "Agent | None" = None) -> None:
-    from physai.training.run import run_training
+@contextlib.contextmanager
+def _ending(config: "TrainConfig", run_dir: Path) -> Iterator[None]:
+    """Context that trains; at its end the best policy is exported, or the user told how to go on."""
     from physai.training.stopping import Interrupted
 
     complete = (run_dir / "summary.json").is_file()
     try:
-        run_training(config, run_dir, resume, agent)
-        if not study.is_running():  # of many trials, few are for a robot
-            _export(config, run_dir, complete)
+        yield
+        _export(config, run_dir, complete)
     except Interrupted as stopped:
         print(f"\nStopped by {stopped}; everything is saved. Go on with:\n  python -m physai.train resume={run_dir}")
         sys.exit(stopped.exit_code)

@@ -14,7 +14,8 @@ from filelock import FileLock
 from hypothesis import HealthCheck, settings
 from omegaconf import OmegaConf
 
-from physai.config import compose, conf_dir, validate
+from physai.compose import compose, conf_dir
+from physai.config import validate
 from physai.envs.simulation import EnvConfig
 from physai.training.config import TrainConfig
 from physai.training.run import run_training

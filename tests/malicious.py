@@ -170,7 +170,7 @@ EVALUATE: dict[str, Edit] = {
         "physai.envs.gym_env.RobotGymEnv", env="reacher", overrides=["env.physics._target_=evil.Thing"]
     ),
     "configs of ours from a package": task(
-        "physai.config.compose", name="train", overrides=["hydra.searchpath=[pkg://evil]"]
+        "physai.compose.compose", name="train", overrides=["hydra.searchpath=[pkg://evil]"]
     ),
     "a part that drives a robot": at("env.physics._target_", "physai.ros.RosPhysics"),
     # Its own module
@@ -204,7 +204,7 @@ EVALUATE: dict[str, Edit] = {
     # Its files
     "a pickle for the best policy": checkpoint("best.pt"),
     "the environment's secrets": at("logger.exp_name", "${oc.env:HOME}"),
-    "a file of the disk": at("extra", "${search_space:../../../etc/passwd}"),
+    "a file of the disk": at("extra", "${oc.decode:${oc.env:HOME}}"),
     "a name that is a path": at("randomization.name", "/../../mark"),
 }
 """What ``evaluate``, ``export`` and ``play`` meet."""

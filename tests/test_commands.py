@@ -119,6 +119,7 @@ BAD_TRAINING = {
         "cannot create the run folder /proc/nowhere/run",
     ),
     "resume of nothing": (["resume=nowhere"], "nowhere: no run there"),
+    "an interval in a sweep": (["-m", "seed=interval(0,3)"], "python -m physai.search looks through an interval"),
     "bad value in a sweep": (["-m", "seed=0,1", "algo.optimizer.lr=1e-3,-1"], "Invalid learning rate: -1"),
 }
 
@@ -325,7 +326,7 @@ def test_plot_overlays_runs(run, copied, tmp_path):
     assert (tmp_path / "both.png").read_bytes().startswith(b"\x89PNG")
 
 
-@pytest.mark.parametrize("module", ["train", "evaluate", "export", "play", "plot"])
+@pytest.mark.parametrize("module", ["train", "search", "evaluate", "export", "play", "plot"])
 def test_help_shows_examples_and_every_value(run, module):
     code, output, _ = run(module, "--help")
     assert code == 0

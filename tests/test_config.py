@@ -6,8 +6,9 @@ from pathlib import Path
 import pytest
 from omegaconf import OmegaConf
 
-import physai.config
-from physai.config import compose, conf_dir, validate
+import physai.compose
+from physai.compose import compose, conf_dir
+from physai.config import validate
 from physai.errors import UserError
 from physai.policies import GaussianActor
 from physai.training.agent import Agent
@@ -132,8 +133,8 @@ def test_a_run_that_collects_while_it_learns_keeps_one_more_core_busy(processes,
 def test_a_container_s_share_of_the_cores_is_all_that_there_is(monkeypatch, tmp_path, limit, cores):
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(8)), raising=False)
     (tmp_path / "cpu.max").write_text(limit)
-    monkeypatch.setattr(physai.config, "_CPU_MAX", tmp_path / "cpu.max")
-    assert physai.config.cores() == cores
+    monkeypatch.setattr(physai.compose, "_CPU_MAX", tmp_path / "cpu.max")
+    assert physai.compose.cores() == cores
 
 
 def test_counts_may_be_written_as_people_write_them():

@@ -10,7 +10,8 @@ import pytest
 from omegaconf import OmegaConf
 
 from physai import artifact, cli, foreign, train
-from physai.config import compose, conf_dir, validate
+from physai.compose import compose, conf_dir
+from physai.config import validate
 from physai.errors import UserError
 from physai.plots.runs import plot_runs
 from physai.training.config import TrainConfig
@@ -164,7 +165,8 @@ def test_a_run_of_ones_own_parts_is_judged_and_exported_where_it_was_trained(own
     exported = []
     monkeypatch.setattr(artifact, "export_policy", lambda *_, config: exported.append(config))
     config = validate(TrainConfig, compose("train", [*TINY, EXPORTED, "env.task._target_=mypackage.Mine"]))
-    train._run(config, own, resume=True)
+    with train._ending(config, own):
+        run_training(config, own, resume=True)
     assert (own / "summary.json").is_file()
     assert exported == [config]
 

@@ -1,10 +1,8 @@
-"""Sweeps whose jobs run in other processes, and searches that are killed, as a user runs them."""
+"""Sweeps whose jobs run in other processes, as a user runs them."""
 
-import csv
 import json
 import os
 import signal
-import subprocess
 import time
 
 import pytest
@@ -114,32 +112,3 @@ def test_a_signal_to_a_parallel_sweep_ends_its_jobs(tmp_path, launcher, number):
 def start(arguments, cwd):
     """Start a sweep in a process group of its own."""
     return command("train", *SWEEP, *arguments, cwd=cwd, start_new_session=True)
-
-
-def test_a_killed_search_goes_on_and_redoes_nothing(tmp_path):
-    search = ("hydra/sweeper=optuna", "hydra.sweeper.n_trials=8")
-    sweep = tmp_path / "sweep"
-    process = start(search, tmp_path)
-    wait_until(lambda: len(finished(sweep)) >= 3 and (sweep / "3" / "metrics.csv").is_file(), process)
-    os.killpg(process.pid, signal.SIGKILL)
-    process.wait()
-    before = finished(sweep)
-    assert 3 <= len(before) < 8
-    code, output = run(*search, cwd=tmp_path)
-    assert code == 0, output
-    after = finished(sweep)
-    assert {name: after[name] for name in before} == before
-    assert len(after) == 8
-    with open(sweep / "study.csv", newline="") as file:
-        trials = list(csv.DictReader(file))
-    assert [trial["state"] for trial in trials].count("complete") == 8
-    for trial in trials:
-        if trial["state"] == "complete":
-            assert float(trial["success rate"]) == json.loads(after[trial["run"]])["success_rate"]
-    names = [key for key in trials[0] if key.startswith("algo.")]
-    assert len({tuple(trial[key] for key in names) for trial in trials}) == 8  # what was killed is tried again
-    assert "the best of 8 trials" in output
-    assert (sweep / "study.png").read_bytes().startswith(b"\x89PNG")
-    again = subprocess.run(process.args, cwd=tmp_path, capture_output=True, text=True)
-    assert "8 trials are done, 0 are left" in again.stdout
-    assert finished(sweep) == after

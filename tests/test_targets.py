@@ -3,7 +3,7 @@
 import pytest
 from omegaconf import OmegaConf
 
-from physai.config import compose
+from physai.compose import compose
 from physai.errors import UserError
 from physai.targets import find
 from physai.train import _Training

@@ -6,8 +6,9 @@ import sys
 
 import pytest
 
-from physai import cli, train
-from physai.config import compose
+from physai import train
+from physai.cli import command as cli
+from physai.compose import compose
 from physai.errors import UserError
 from physai.training.agent import Agent
 from tests.training.small import SMALL
@@ -58,11 +59,11 @@ def test_before_the_first_frame_nothing_is_built_twice_and_nothing_imported_that
 def training(monkeypatch):
     """The command, which notes what it would train instead of training it."""
     trained = []
-    monkeypatch.setattr(train, "_run", lambda config, run_dir, resume, agent: trained.append(agent))
+    monkeypatch.setattr("physai.training.run.run_training", lambda config, run_dir, agent: trained.append(agent))
     commands = []
 
     def make(keep):
-        commands.append(train._Training(keep))
+        commands.append(train.Training(keep))
         return commands[-1], trained
 
     yield make

@@ -11,7 +11,8 @@ from pathlib import Path
 
 from rich.table import Table
 
-from physai.config import compose, validate
+from physai.compose import compose
+from physai.config import validate
 from physai.training.config import TrainConfig
 
 

@@ -8,7 +8,8 @@ from torch import Tensor
 from torchrl.envs import TransformedEnv
 from torchrl.envs.transforms import Compose, Transform
 
-from physai.config import Config, PositiveFloat, compose, validate
+from physai.compose import compose
+from physai.config import Config, PositiveFloat, validate
 from physai.envs.robot_env import RobotEnv
 from physai.envs.simulation import EnvConfig, Simulation
 from physai.physics import RandomizationConfig

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 
 import matplotlib
 import numpy as np
@@ -10,36 +10,33 @@ import numpy as np
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
-if TYPE_CHECKING:
-    import optuna
 
-
-def plot_study(study: "optuna.Study", objective: str, names: Mapping[str, str], output: Path) -> None:
+def plot_study(trials: Any, objective: str, minimize: bool, names: Mapping[str, str], output: Path) -> None:
     """Draw the value of every trial (left), and how the parameters go together with it (right).
 
     Args:
-        study: With at least one trial that has a value.
-        objective: What that value is.
-        names: What to call its parameters.
+        trials: A DataFrame with the columns ``run``, ``objective`` (NaN: it came to no end) and the parameters.
+        objective: What the value of a trial is.
+        minimize: Whether the best is the smallest.
+        names: The parameters, and what to call them.
         output: The PNG to write.
     """
-    trials = study.trials_dataframe(("number", "value", "params"))
-    ended = trials[np.isfinite(trials["value"])]
-    best = ended["value"].cummax() if study.direction.name == "MAXIMIZE" else ended["value"].cummin()
+    ended = trials[np.isfinite(trials[objective].astype(float))]
+    best = ended[objective].cummin() if minimize else ended[objective].cummax()
     figure, (left, right) = plt.subplots(1, 2, figsize=(11, 4.2), layout="constrained")
-    left.scatter(ended["number"], ended["value"], s=22, alpha=0.7, label="trials")
-    left.step(ended["number"], best, where="post", linewidth=2, color="tab:orange", label="best so far")
-    lost = trials[~np.isfinite(trials["value"])]["number"]
+    left.scatter(ended["run"], ended[objective], s=22, alpha=0.7, label="trials")
+    left.step(ended["run"], best, where="post", linewidth=2, color="tab:orange", label="best so far")
+    lost = trials["run"].drop(ended.index)
     left.plot(lost, np.zeros(len(lost)), "x", color="tab:red", transform=left.get_xaxis_transform(), clip_on=False,
               label="no value")  # fmt: skip
     left.set_title(objective.capitalize())
     left.set_xlabel("trial")
     left.xaxis.set_major_locator(matplotlib.ticker.MaxNLocator(integer=True))
     left.legend(frameon=False)
-    ranks = ended.rank(numeric_only=True)
-    columns = [f"params_{key}" for key in names if f"params_{key}" in ranks and ranks[f"params_{key}"].nunique() > 1]
-    together = ranks[columns].corrwith(ranks["value"]).dropna().sort_values(key=abs)
-    right.barh([names[column.removeprefix("params_")] for column in together.index], together)
+    ranks = ended[[objective, *names]].rank(numeric_only=True)
+    columns = [key for key in names if key in ranks and ranks[key].nunique() > 1]
+    together = ranks[columns].corrwith(ranks[objective]).dropna().sort_values(key=abs)
+    right.barh([names[key] for key in together.index], together)
     right.set_title("Rank correlation of parameters with it")
     right.set_xlim(-1, 1)
     right.axvline(0, color="black", linewidth=0.8)

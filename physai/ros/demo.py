@@ -14,7 +14,8 @@ from omegaconf import DictConfig
 from rich.console import Console
 
 from physai import cli
-from physai.config import Config, Count, PositiveFloat, Seed, compose, conf_dir, validate
+from physai.compose import compose, conf_dir
+from physai.config import Config, Count, PositiveFloat, Seed, validate
 from physai.deploy import ControllerConfig, Metadata, load_policy, read_metadata
 from physai.deploy.limits import smallest_margin
 from physai.errors import UserError

@@ -2,7 +2,7 @@
 
 from typing import Annotated, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from physai.collectors import CollectorConfig
 from physai.config import Config, Count, PackageName, Seed
@@ -40,19 +40,6 @@ class PolicyConfig(Config):
         return int(self.actor.get("memory_size", 0))
 
 
-class ObjectiveConfig(Config):
-    """One file of ``conf/objective``: what a sweep with Optuna makes best."""
-
-    direction: Literal["maximize", "minimize"]
-    target: Annotated[float, Field(gt=0, le=1)] | None
-
-    @model_validator(mode="after")
-    def _direction_fits(self) -> "ObjectiveConfig":
-        if (self.direction == "minimize") != (self.target is not None):
-            raise ValueError(": a target's time is to be minimized, a success rate without target to be maximized")
-        return self
-
-
 class TrainConfig(Config):
     """Everything that decides the outcome of a run."""
 
@@ -64,7 +51,6 @@ class TrainConfig(Config):
     normalization: NormalizationConfig
     checkpoint: CheckpointConfig
     evaluation: EvaluationConfig
-    objective: ObjectiveConfig
     logger: Target
     seed: Seed
     total_frames: Count

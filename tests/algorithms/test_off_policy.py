@@ -9,7 +9,7 @@ import torch
 from tensordict import TensorDict
 
 from physai.algorithms import NonFiniteError
-from physai.config import compose
+from physai.compose import compose
 from physai.errors import UserError
 from physai.policies import Critic, DeterministicActor, TanhGaussianActor
 from physai.training import checkpoint

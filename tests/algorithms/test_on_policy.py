@@ -9,7 +9,7 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from physai.algorithms import NonFiniteError, OnPolicy
-from physai.config import compose
+from physai.compose import compose
 from physai.errors import UserError
 from physai.policies import Critic, GaussianActor
 from tests.algorithms.assemble import assemble

@@ -7,7 +7,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.objectives import ClipPPOLoss
 
 from physai.algorithms import FusedClipPPOLoss
-from physai.config import compose
+from physai.compose import compose
 from physai.policies import Critic, GaussianActor
 from tests.algorithms.assemble import assemble
 

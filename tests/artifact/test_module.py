@@ -6,7 +6,8 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictSequential
 
 from physai.artifact.module import make_deployable, save, script
-from physai.config import compose, validate
+from physai.compose import compose
+from physai.config import validate
 from physai.deploy.archive import content_sha256
 from physai.envs.make import make
 from physai.errors import UserError

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from physai.config import compose, validate
+from physai.compose import compose
+from physai.config import validate
 from physai.deploy import Controller, ControllerConfig, Goal, JointState, State
 from physai.deploy.following import Following
 from physai.physics import ParameterLayout, RandomizationConfig, RobotState

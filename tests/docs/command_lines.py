@@ -12,7 +12,8 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, OmegaConf
 
 from physai.bench.__main__ import _options
-from physai.config import compose, validate
+from physai.compose import compose
+from physai.config import validate
 from physai.envs.simulation import EnvConfig
 from physai.evaluate import EvaluateConfig
 from physai.export import ExportConfig
@@ -20,6 +21,7 @@ from physai.play import PlayConfig
 from physai.plot import PlotConfig
 from physai.ros.demo import DemoConfig
 from physai.ros.topics.commands import controller_topic
+from physai.search.config import SearchConfig
 from physai.signals import Quantity
 from physai.training.config import TrainConfig
 from tests.docs.blocks import ROOT, hooks
@@ -29,6 +31,7 @@ PACKAGE = ROOT / "physai" / "ros" / "package"
 SOURCES = "\n".join(path.read_text() for path in sorted((ROOT / "physai").rglob("*.py")))
 COMMANDS = {
     "physai.train": ("train", TrainConfig),
+    "physai.search": ("search", SearchConfig),
     "physai.evaluate": ("evaluate", EvaluateConfig),
     "physai.export": ("export", ExportConfig),
     "physai.play": ("play", PlayConfig),

@@ -6,7 +6,8 @@ import shutil
 import pytest
 import yaml
 
-from physai.config import compose, conf_dir, validate
+from physai.compose import compose, conf_dir
+from physai.config import validate
 from physai.deploy import State
 from physai.errors import UserError
 from physai.export import export
@@ -17,7 +18,7 @@ from tests.docs.command_lines import SOURCES, check, exists, parameter_class
 from tests.test_contributing import EXAMPLE
 
 HOOKS = hooks()
-BROUGHT = ("collector", "env", "experiment", "logger", "objective", "policy", "randomization")
+BROUGHT = ("collector", "env", "experiment", "logger", "policy", "randomization")
 CONSOLE = {block.text.splitlines()[0]: block for block in blocks("console")}
 
 

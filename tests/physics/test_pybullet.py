@@ -207,7 +207,8 @@ def seen():
     return (bullet.getNumBodies(0), bullet.getPhysicsEngineParameters(0), bullet.getBasePositionAndOrientation(ball),
             bullet.getBaseVelocity(ball), bullet.getDynamicsInfo(ball, -1))
 before = seen()
-from physai.config import compose, validate
+from physai.compose import compose
+from physai.config import validate
 from physai.envs.simulation import EnvConfig
 from physai.physics import RobotState
 from physai.physics.pybullet import PyBulletPhysics

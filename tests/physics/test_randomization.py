@@ -2,7 +2,8 @@
 
 import pytest
 
-from physai.config import compose, validate
+from physai.compose import compose
+from physai.config import validate
 from physai.physics import ParameterLayout, RandomizationConfig
 from physai.robots import RobotSpec
 

@@ -6,7 +6,8 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from physai.config import compose, validate
+from physai.compose import compose
+from physai.config import validate
 from physai.envs.simulation import EnvConfig
 from physai.robots import JointCommand, RobotConfig, RobotSpec
 from physai.robots.command import LEAD

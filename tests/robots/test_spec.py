@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from physai.config import compose, validate
+from physai.compose import compose
+from physai.config import validate
 from physai.envs.simulation import EnvConfig
 from physai.errors import UserError
 from physai.robots import RobotConfig, RobotSpec

@@ -11,7 +11,8 @@ from typing import Any
 
 from omegaconf import OmegaConf
 
-from physai.config import compose, validate
+from physai.compose import compose
+from physai.config import validate
 from physai.training.agent import Agent
 from physai.training.callbacks import EvaluationCallback
 from physai.training.config import TrainConfig

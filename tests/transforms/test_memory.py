@@ -6,7 +6,8 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.envs.utils import check_env_specs
 
 from physai.collectors import make_collector
-from physai.config import compose, validate
+from physai.compose import compose
+from physai.config import validate
 from physai.envs.make import make_env
 from physai.training.config import TrainConfig
 from physai.transforms import Memory

@@ -3,7 +3,8 @@ import pytest
 import torch
 from scipy import stats
 
-from physai.config import compose, validate
+from physai.compose import compose
+from physai.config import validate
 from physai.envs.make import make
 from physai.errors import UserError
 from physai.physics import ParameterLayout, RandomizationConfig

@@ -6,7 +6,8 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
-from physai.config import compose, conf_dir, nearest, validate
+from physai.compose import compose, conf_dir
+from physai.config import nearest, validate
 from physai.envs.simulation import EnvConfig
 from physai.errors import UserError
 from physai.physics import ActuatorDelay, ParameterLayout, RandomizationConfig, RobotState, SensorErrors

@@ -1,7 +1,7 @@
 """The end of a sweep: one table of all its runs, one plot, and no failure unseen."""
 
+import json
 import os
-import shlex
 import signal
 import sys
 from pathlib import Path
@@ -12,10 +12,7 @@ from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 from rich.table import Table
 
-from physai import study
 from physai.errors import UserError
-
-_BEST = 10
 
 
 class SweepReport(Callback):
@@ -43,11 +40,8 @@ class SweepReport(Callback):
         from physai.plots.runs import plot_runs
 
         folder = Path(config.hydra.sweep.dir)
-        if study.searched(config) is not None:
-            _report_study(folder)
-            return
         runs = sorted((path.parent.parent for path in folder.glob("*/.hydra/overrides.yaml")), key=_number)
-        summaries = {run: study.read_summary(run) for run in runs}
+        summaries = {run: _summary(run) for run in runs}
         table = Table(title=f"{folder}", title_justify="left")
         for column in ("run", "differs by", "success", "steps", "frames", "seconds"):
             table.add_column(column, justify="left" if column in ("run", "differs by") else "right")
@@ -72,34 +66,9 @@ class SweepReport(Callback):
             sys.exit(1)
 
 
-def _report_study(folder: Path) -> None:
-    """Write ``study.csv`` and ``study.png``, and show the best trials; exit with code 1 if there are none."""
-    from physai.plots.study import plot_study
-
-    found = study.load(folder)
-    names = study.short_names(key for trial in found.trials for key in trial.params)
-    study.write_csv(found, folder / "study.csv")
-    over = [(trial.value, trial) for trial in found.trials if trial.value is not None]
-    best = sorted(over, key=lambda one: one[0], reverse=found.direction.name == "MAXIMIZE")
-    table = Table(title=f"{folder}: the best of {len(over)} trials", title_justify="left")
-    for column in ("run", study.objective_name(found), *names.values()):
-        table.add_column(column, justify="left" if column == "run" else "right")
-    for value, trial in best[:_BEST]:
-        table.add_row(str(trial.number), _short(value), *(_short(trial.params.get(key)) for key in names))
-    Console().print(table)
-    for trial in found.trials:
-        if study.failed(folder, trial):
-            print(f"error: {folder / str(trial.number)}: {_reason(folder / str(trial.number))}", file=sys.stderr)
-    if not best:
-        print(f"error: none of {len(found.trials)} trials came to an end", file=sys.stderr)
-        sys.exit(1)
-    plot_study(found, study.objective_name(found), names, folder / "study.png")
-    print(f"All trials: {folder / 'study.csv'}, {folder / 'study.png'}. Train with the best values:")
-    print("  python -m physai.train " + shlex.join(study.command(found, best[0][1])))
-
-
-def _short(value: Any) -> str:
-    return f"{value:.3g}" if isinstance(value, float) else "-" if value is None else str(value)
+def _summary(run: Path) -> dict[str, Any] | None:
+    path = run / "summary.json"
+    return json.loads(path.read_text()) if path.is_file() else None
 
 
 def _number(run: Path) -> tuple[int, str]:

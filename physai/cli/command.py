@@ -2,50 +2,44 @@
 
 import contextlib
 import ctypes
-import functools
 import gc
 import importlib.util
 import itertools
 import os
-import select
 import shutil
 import signal
 import socket
 import sys
 import threading
-import time
 import traceback
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
 import hydra
 from hydra._internal.callbacks import Callbacks
 from hydra.core.hydra_config import HydraConfig
-from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.override_parser.types import Override
 from hydra.core.utils import run_job
-from hydra.errors import OverrideParseException
 from hydra.types import HydraContext, RunMode
 from omegaconf import DictConfig, OmegaConf, read_write
 from omegaconf.errors import OmegaConfBaseException
 
-from physai import study
-from physai.config import compose, conf_dir, initialized, jobs_at_once, set_plugin_defaults
+from physai.compose import compose, conf_dir, initialized, jobs_at_once, parse, set_plugin_defaults
 from physai.errors import UserError
+from physai.processes import end_with
 
 _SIGNALS = (signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)
 
 Job = Callable[[DictConfig, Path], object]
 
 
-def main(name: str, job: Job, check: Callable[[DictConfig], object]) -> None:
+def main(name: str, job: Job, check: Callable[[DictConfig], object], given: Sequence[str] | None = None) -> None:
     """Run a command: ``job`` once, or once per combination of a sweep (``-m``).
 
     Args:
         name: Its config, ``conf/<name>.yaml``.
         job: Gets the composed config and the folder of its run.
         check: Raises a UserError if a config is bad; it sees every combination before anything is created or runs.
+        given: Overrides; None takes those of the command line.
     """
     flags = [argument for argument in sys.argv[1:] if argument.startswith("-")]
     with guard():
@@ -55,25 +49,31 @@ def main(name: str, job: Job, check: Callable[[DictConfig], object]) -> None:
             )
     if set(flags) <= {"-m", "--multirun"}:
         with guard(), _imports():
-            config, pinned = _check_all(name, check, overrides(), sweep=bool(flags))
+            given = overrides() if given is None else list(given)
+            config, pinned = _check_all(name, check, given, sweep=bool(flags))
         if config.hydra.mode is None and not flags:
             with guard():
-                _run(name, _guarded(job), config)
+                _run(name, job, config)
             return
         sys.argv += pinned
     set_plugin_defaults()
-    with guard(), study.without_result():
-        hydra.main(version_base="1.3", config_path=str(conf_dir().absolute()), config_name=name)(_guarded(job))()
+    with guard():
+        hydra.main(version_base="1.3", config_path=str(conf_dir().absolute()), config_name=name)(_of_sweep(job))()
 
 
-def _run(name: str, job: Callable[[DictConfig], object], config: DictConfig) -> None:
+def _run(name: str, job: Job, config: DictConfig) -> None:
     """Run one job, like Hydra's main, but with the config that was checked: Hydra would compose it twice more."""
     with read_write(config.hydra):
         config.hydra.mode = RunMode.RUN
+
+    def run(node: DictConfig) -> None:
+        with guard():  # within Hydra, which would say more about an error
+            job(node, _begin(node))
+
     callbacks = Callbacks(config)
     with initialized(name) as loader:
         callbacks.on_run_start(config=config, config_name=name)
-        returned = run_job(job, config, "hydra.run.dir", None, HydraContext(loader, callbacks))
+        returned = run_job(run, config, "hydra.run.dir", None, HydraContext(loader, callbacks))
         callbacks.on_run_end(config=config, config_name=name, job_return=returned)
     returned.return_value  # noqa: B018  # raises what the job has raised
 
@@ -99,17 +99,17 @@ class guard:  # noqa: N801
         if isinstance(error, UserError | OSError) and os.environ.get("HYDRA_FULL_ERROR") == "1":
             traceback.print_exception(error)
         if isinstance(error, UserError):
-            print(f"error: {_printable(str(error))}", file=sys.stderr)
+            print(f"error: {printable(str(error))}", file=sys.stderr)
             sys.exit(2)
         if isinstance(error, OSError):
             where = str(error.filename or "the disk")
-            print(f"error: {_printable(f'{where}: {error.strerror or error}')}", file=sys.stderr)
+            print(f"error: {printable(f'{where}: {error.strerror or error}')}", file=sys.stderr)
             sys.exit(2)
         if isinstance(error, KeyboardInterrupt):
             sys.exit(130)
 
 
-def _printable(text: str) -> str:
+def printable(text: str) -> str:
     """Text as one line that a terminal shows and does not obey; names in it may be from a file of anyone's."""
     return "".join(one if one.isprintable() else one.encode("unicode_escape").decode() for one in text)
 
@@ -144,17 +144,16 @@ def _check_all(
         would choose anew.
     """
     key = "hydra.sweep.dir" if sweep else "hydra.run.dir"
-    fixed = [one for one in given if not (sweep and _sweeps(one))]
-    whole = compose(name, fixed, hydra=True)
+    jobs: Iterable[DictConfig]
+    if sweep:
+        fixed = [str(one.input_line) for one in parse(given) if not one.is_sweep_override()]
+        whole, jobs = compose(name, fixed, hydra=True), (compose(name, one, hydra=True) for one in _combinations(given))
+    else:
+        jobs = [whole := compose(name, given, hydra=True)]
     try:
         folder = str(OmegaConf.select(whole, key))
-        searched = study.searched(whole, given) if sweep else None
     except OmegaConfBaseException as error:
         raise UserError(" ".join(str(error).split())) from None
-    jobs: Iterable[DictConfig] = [whole]
-    if sweep:
-        every = _combinations(given) if searched is None else _samples([*fixed, *searched])
-        jobs = (compose(name, one, hydra=True) for one in every)
     launcher = whole.hydra.launcher._target_
     if sweep and launcher.endswith(".SlurmLauncher") and shutil.which("srun") is None:
         raise UserError(
@@ -166,9 +165,9 @@ def _check_all(
         check(OmegaConf.masked_copy(config, [key for key in config if key != "hydra"]))
     with read_write(whole.hydra):
         OmegaConf.update(whole, key, folder)
-    if folder == "." and searched is None:
+    if folder == ".":
         return whole, []
-    if searched is None and any(Path(folder).glob("*/.hydra" if sweep else ".hydra")):
+    if any(Path(folder).glob("*/.hydra" if sweep else ".hydra")):
         way_out = f"choose another {key}" if sweep else f"go on with resume={folder}, or choose another {key}"
         raise UserError(f"{folder} holds a run already: {way_out}")
     try:
@@ -178,90 +177,52 @@ def _check_all(
     if not os.access(folder, os.W_OK):
         raise UserError(f"cannot write to the run folder {folder}")
     pinned = [f"{key}='{folder}'"]
-    if searched is not None:
-        return whole, [*pinned, *study.begin(Path(folder), whole, searched, fixed)]
     if sweep and launcher.endswith(".LocalLauncher") and whole.hydra.sweeper.max_batch_size is None:
         pinned.append(f"hydra.sweeper.max_batch_size={jobs_at_once(whole)}")  # submitit would start all jobs at once
     return whole, pinned
 
 
-def _sweeps(override: str) -> bool:
-    try:
-        return OverridesParser.create().parse_override(override).is_sweep_override()
-    except OverrideParseException:
-        raise UserError(f"'{override}' is not an override such as key=value") from None
-
-
 def _combinations(given: list[str]) -> Iterable[list[str]]:
     """Every job of a sweep."""
     choices = []
-    for override in OverridesParser.create().parse_overrides(given):
-        if override.is_sweep_override() and not override.is_discrete_sweep():
-            raise UserError(f"'{override.input_line}': hydra/sweeper=optuna searches an interval, nothing else does")
-        choices.append(_values(override))
+    for override in parse(given):
+        if not override.is_sweep_override():
+            choices.append([str(override.input_line)])
+        elif override.is_discrete_sweep():
+            key = override.get_key_element()
+            choices.append([f"{key}={value}" for value in override.sweep_string_iterator()])
+        else:
+            raise UserError(f"'{override.input_line}': python -m physai.search looks through an interval; -m does not")
     return (list(one) for one in itertools.product(*choices))
 
 
-def _samples(given: list[str]) -> Iterable[list[str]]:
-    """So many jobs of a search that every choice is in one of them, and something of every interval."""
-    choices = [_values(override) for override in OverridesParser.create().parse_overrides(given)]
-    most = max(len(values) for values in choices)
-    return [[values[min(job, len(values) - 1)] for values in choices] for job in range(most)]
+def _begin(config: DictConfig) -> Path:
+    """Make this process ready for a job; return the folder of its run."""
+    for library in ("OMP", "MKL", "OPENBLAS"):  # for what this process, or one of the job's, loads from here on
+        os.environ[f"{library}_NUM_THREADS"] = str(config.get("threads", 1))
+    folder = Path(HydraConfig.get().runtime.output_dir)
+    return folder.relative_to(Path.cwd()) if folder.is_relative_to(Path.cwd()) else folder
 
 
-def _values(override: Override) -> list[str]:
-    if not override.is_sweep_override():
-        return [str(override.input_line)]
-    key = override.get_key_element()
-    if override.is_discrete_sweep():
-        return [f"{key}={value}" for value in override.sweep_string_iterator()]
-    interval: Any = override.value()
-    low, high = interval.start, interval.end
-    between = (low + high) // 2 if isinstance(low, int) else low + (high - low) / 3
-    return [f"{key}={value}" for value in (low, between, high)]
-
-
-def _guarded(job: Job) -> Callable[[DictConfig], object]:
+def _of_sweep(job: Job) -> Callable[[DictConfig], None]:
     starter, host = os.getpid(), socket.gethostname()
 
-    def run(config: DictConfig) -> object:
-        context = HydraConfig.get()
-        for library in ("OMP", "MKL", "OPENBLAS"):  # for what this process, or one of the job's, loads from here on
-            os.environ[f"{library}_NUM_THREADS"] = str(config.get("threads", 1))
-        folder = Path(context.runtime.output_dir)
-        folder = folder.relative_to(Path.cwd()) if folder.is_relative_to(Path.cwd()) else folder
-        if context.mode is RunMode.RUN:
-            with guard():
-                return job(config, folder)
+    def run(config: DictConfig) -> None:
+        context, folder = HydraConfig.get(), _begin(config)
         print(f"\n[{context.job.num}] {context.job.override_dirname}", flush=True)
         here = (os.getpid(), socket.gethostname()) == (starter, host)
         if not here and socket.gethostname() == host and sys.platform == "linux" and "SLURM_JOB_ID" not in os.environ:
-            _end_with(starter)
+            end_with(starter)
         try:
             with contextlib.nullcontext() if here else _output_to(folder / "output.txt"):
-                return job(config, folder)
+                job(config, folder)
         except Exception as error:
             # A sweep goes on without the job that failed; its report names it.
             with contextlib.suppress(OSError):
                 (folder / "error.txt").write_text(f"{error}\n\n{traceback.format_exc()}")
             print(f"error: [{context.job.num}] {error}", file=sys.stderr)
-            return None
 
     return run
-
-
-@functools.cache  # a process may run several jobs
-def _end_with(starter: int) -> None:
-    """Stop this process, as SIGTERM does, once the sweep that it works for is gone; not all launchers see to that."""
-
-    def watch() -> None:
-        with contextlib.suppress(ProcessLookupError):  # it is gone already
-            select.select([os.pidfd_open(starter)], [], [])  # also ends where nobody has asked how the sweep ended
-        os.kill(os.getpid(), signal.SIGTERM)  # a run saves itself
-        time.sleep(20)
-        os._exit(128 + signal.SIGTERM)
-
-    threading.Thread(target=watch, daemon=True).start()
 
 
 @contextlib.contextmanager
