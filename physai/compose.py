@@ -119,7 +119,7 @@ def parse(overrides: Iterable[str]) -> list[Override]:
     try:
         return OverridesParser.create().parse_overrides(list(overrides))
     except OverrideParseException as error:
-        raise UserError(f"'{error.override}' is not an override such as key=value") from None
+        raise UserError(f"'{error.override}' is not an override such as key=value") from error
 
 
 def compose(name: str, overrides: Iterable[str] = (), hydra: bool = False) -> DictConfig:
@@ -141,18 +141,19 @@ def compose(name: str, overrides: Iterable[str] = (), hydra: bool = False) -> Di
         except MissingConfigException as error:
             wanted = str(error.missing_cfg_file).rpartition("/")[2]
             if wanted in _PLUGINS:
-                raise UserError(f"{error.missing_cfg_file}: pip install 'physai[{_PLUGINS[wanted]}]'") from None
-            raise UserError(f"{error.missing_cfg_file}: no such config{nearest(wanted, error.options or [])}") from None
+                raise UserError(f"{error.missing_cfg_file}: pip install 'physai[{_PLUGINS[wanted]}]'") from error
+            hint = nearest(wanted, error.options or [])
+            raise UserError(f"{error.missing_cfg_file}: no such config{hint}") from error
         except OverrideParseException as error:
-            raise UserError(f"'{error.override}' is not an override such as key=value") from None
+            raise UserError(f"'{error.override}' is not an override such as key=value") from error
         except (HydraException, OmegaConfBaseException) as error:
             if exists := re.search(r"already at '([^']+)'", str(error)):
-                raise UserError(f"'{exists[1]}' exists already: change it without the +") from None
+                raise UserError(f"'{exists[1]}' exists already: change it without the +") from error
             match = re.search(r"Could not (?:override|append to config|delete from config)[^']*'([^'=]+)", str(error))
             if match is None:
                 match = re.search(r"Key '([^']+)'", str(error))
             if match is None or not overrides:
-                raise UserError(" ".join(str(error).split())) from None
+                raise UserError(" ".join(str(error).split())) from error
             key = match[1].split("@")[0]
             chosen = [one for one in overrides if (conf_dir() / one.partition("=")[0]).is_dir()]  # env=..., algo=...
-            raise UserError(f"unknown key '{key}'{nearest(key, keys(hydra_compose(name, chosen)))}") from None
+            raise UserError(f"unknown key '{key}'{nearest(key, keys(hydra_compose(name, chosen)))}") from error

@@ -42,9 +42,9 @@ def validate(model: type[C], node: DictConfig) -> C:
     try:
         data = OmegaConf.to_container(node, resolve=True, throw_on_missing=True)
     except MissingMandatoryValue as error:
-        raise UserError(f"{error.full_key}=... is required") from None
+        raise UserError(f"{error.full_key}=... is required") from error
     except OmegaConfBaseException as error:
-        raise UserError(" ".join(str(error).split())) from None
+        raise UserError(" ".join(str(error).split())) from error
     try:
         return model.model_validate(data)
     except ValidationError as error:
@@ -52,13 +52,13 @@ def validate(model: type[C], node: DictConfig) -> C:
         key = ".".join(str(part) for part in first["loc"])
         if first["type"] == "extra_forbidden":
             known = [name for name in keys(node) if name != key and not name.startswith(f"{key}.")]
-            raise UserError(f"unknown key '{key}'{nearest(key, known)}") from None
+            raise UserError(f"unknown key '{key}'{nearest(key, known)}") from error
         if first["type"] == "missing":
-            raise UserError(f"{key} is missing") from None
+            raise UserError(f"{key} is missing") from error
         if first["type"] == "value_error" and isinstance(first["ctx"]["error"], UserError | ValueError):
-            raise UserError(f"{key}{first['ctx']['error']}") from None
+            raise UserError(f"{key}{first['ctx']['error']}") from error
         message = first["msg"][0].lower() + first["msg"][1:]
-        raise UserError(f"{key}: {message}, got {first['input']!r}") from None
+        raise UserError(f"{key}: {message}, got {first['input']!r}") from error
 
 
 def nearest(name: str, options: Iterable[str]) -> str:

@@ -130,16 +130,27 @@ def _first_difference(run: Any, wanted: Any, key: str = "") -> str | None:
 
 @contextlib.contextmanager
 def _ending(config: "TrainConfig", run_dir: Path) -> Iterator[None]:
-    """Context that trains; at its end the best policy is exported, or the user told how to go on."""
+    """Context that trains; then the run is drawn and its policy exported, or the user told how to go on."""
     from physai.training.stopping import Interrupted
 
     complete = (run_dir / "summary.json").is_file()
     try:
         yield
+        if not (complete and (run_dir / "training.png").is_file()):
+            _draw(run_dir)
         _export(config, run_dir, complete)
     except Interrupted as stopped:
         print(f"\nStopped by {stopped}; everything is saved. Go on with:\n  python -m physai.train resume={run_dir}")
         sys.exit(stopped.exit_code)
+
+
+def _draw(run_dir: Path) -> None:
+    from physai.plots.runs import plot_runs  # no frame needs to wait for Matplotlib
+
+    try:
+        plot_runs([run_dir], run_dir / "training.png")
+    except UserError as error:
+        print(f"No training.png: {error}")
 
 
 def _export(config: "TrainConfig", run_dir: Path, complete: bool) -> None:

@@ -47,35 +47,36 @@ def main(name: str, job: Job, check: Callable[[DictConfig], object], given: Sequ
             raise UserError(
                 "--experimental-rerun reads a pickle, which may run anything; resume=<run> goes on with a run"
             )
-    if set(flags) <= {"-m", "--multirun"}:
-        with guard(), _imports():
-            given = overrides() if given is None else list(given)
-            config, pinned = _check_all(name, check, given, sweep=bool(flags))
-        if config.hydra.mode is None and not flags:
-            with guard():
-                _run(name, job, config)
-            return
+    if not set(flags) <= {"-m", "--multirun"}:  # --help, --info and such: Hydra's own
+        _leave_to_hydra(name, job)
+        return
+    with guard(), _imports():
+        given = overrides() if given is None else list(given)
+        config, pinned = _check_all(name, check, given, sweep=bool(flags))
+    if flags or config.hydra.mode is not None:
         sys.argv += pinned
-    set_plugin_defaults()
-    with guard():
-        hydra.main(version_base="1.3", config_path=str(conf_dir().absolute()), config_name=name)(_of_sweep(job))()
-
-
-def _run(name: str, job: Job, config: DictConfig) -> None:
-    """Run one job, like Hydra's main, but with the config that was checked: Hydra would compose it twice more."""
-    with read_write(config.hydra):
-        config.hydra.mode = RunMode.RUN
+        _leave_to_hydra(name, job)
+        return
 
     def run(node: DictConfig) -> None:
         with guard():  # within Hydra, which would say more about an error
             job(node, _begin(node))
 
+    # Like Hydra's main, but with the config that was checked: Hydra would compose it twice more.
+    with read_write(config.hydra):
+        config.hydra.mode = RunMode.RUN
     callbacks = Callbacks(config)
-    with initialized(name) as loader:
+    with guard(), initialized(name) as loader:
         callbacks.on_run_start(config=config, config_name=name)
         returned = run_job(run, config, "hydra.run.dir", None, HydraContext(loader, callbacks))
         callbacks.on_run_end(config=config, config_name=name, job_return=returned)
-    returned.return_value  # noqa: B018  # raises what the job has raised
+        returned.return_value  # noqa: B018  # raises what the job has raised
+
+
+def _leave_to_hydra(name: str, job: Job) -> None:
+    set_plugin_defaults()
+    with guard():
+        hydra.main(version_base="1.3", config_path=str(conf_dir().absolute()), config_name=name)(_of_sweep(job))()
 
 
 def overrides() -> list[str]:
@@ -153,7 +154,7 @@ def _check_all(
     try:
         folder = str(OmegaConf.select(whole, key))
     except OmegaConfBaseException as error:
-        raise UserError(" ".join(str(error).split())) from None
+        raise UserError(" ".join(str(error).split())) from error
     launcher = whole.hydra.launcher._target_
     if sweep and launcher.endswith(".SlurmLauncher") and shutil.which("srun") is None:
         raise UserError(
@@ -173,7 +174,7 @@ def _check_all(
     try:
         os.makedirs(folder, exist_ok=True)
     except OSError as error:
-        raise UserError(f"cannot create the run folder {folder}: {error.strerror}") from None
+        raise UserError(f"cannot create the run folder {folder}: {error.strerror}") from error
     if not os.access(folder, os.W_OK):
         raise UserError(f"cannot write to the run folder {folder}")
     pinned = [f"{key}='{folder}'"]

@@ -61,7 +61,7 @@ class Study:
         except BaseException as error:
             self.close()
             if isinstance(error, BlockingIOError):
-                raise UserError(f"{folder}: another search is at work there") from None
+                raise UserError(f"{folder}: another search is at work there") from error
             raise
 
     def close(self) -> None:

@@ -51,13 +51,13 @@ def load_config(
         return validate(TrainConfig, DictConfig(node))
     except UserError as error:
         path = run_dir / ".hydra" / "config.yaml"
-        raise UserError(f"{path}: the run's config is damaged or from another version: {error}") from None
+        raise UserError(f"{path}: the run's config is damaged or from another version: {error}") from error
 
 
 def run_training(
     config: TrainConfig, run_dir: Path, resume: bool = False, agent: Agent | None = None
 ) -> dict[str, Any]:
-    """Train in ``run_dir`` and write ``summary.json`` and ``training.png``; return the summary.
+    """Train in ``run_dir`` and write ``summary.json``; return the summary.
 
     Args:
         config: The run.
@@ -71,8 +71,8 @@ def run_training(
         try:
             summary = json.loads(done.read_text())
             print_summary(summary, f"{run_dir}")
-        except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
-            raise UserError(f"{done}: the run's summary is damaged") from None
+        except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+            raise UserError(f"{done}: the run's summary is damaged") from error
         return summary
     agent = agent or Agent.build(config)
     with contextlib.closing(agent), stop_signals() as stop:
@@ -87,12 +87,6 @@ def run_training(
         result = TrainedPolicy(run_dir, "best", config=config).evaluate(config.evaluation.episodes)
         summary = _summary(config, trainer, evaluation.best_frames, result)
         write_atomically(done, json.dumps(summary, indent=2).encode())
-        from physai.plots.runs import plot_runs  # no frame needs to wait for Matplotlib
-
-        try:
-            plot_runs([run_dir], run_dir / "training.png")
-        except UserError as error:
-            print(f"No training.png: {error}")
     if stop:  # too late to matter for this run, but a sweep must end
         raise Interrupted(stop[0])
     print_summary(summary, f"{config.env.name}: the best policy, on {len(result.success):,} goals it has never seen")
