@@ -6,7 +6,7 @@ from omegaconf import OmegaConf
 from physai.compose import compose
 from physai.errors import UserError
 from physai.targets import find
-from physai.train import _Training
+from physai.train import Training
 
 TINY = ("collector=single", "collector.num_envs=4", "collector.frames_per_batch=64", "algo.minibatch_size=32")
 MODULES = {
@@ -66,6 +66,6 @@ def test_a_part_of_another_kind_is_one_line(key, name):
     node = compose("train", TINY)
     OmegaConf.update(node, key, {"_target_": name}, merge=False)
     with pytest.raises(UserError) as error:
-        _Training().check(node)
+        Training().check(node)
     assert "\n" not in str(error.value)
     assert key.split(".")[-1] in str(error.value) or key.split(".")[0] in str(error.value)
