@@ -215,6 +215,16 @@ def test_target_networks_follow_by_tau(name):
         torch.testing.assert_close(after[key], expected)
 
 
+def test_target_networks_follow_in_steps_in_which_the_actor_does_not_learn_too():
+    algorithm = build("td3", "algo.frames_per_update=32", "algo.actor_every=2")
+    algorithm.update(batch(0))
+    before = snapshot(algorithm)
+    algorithm.update(batch(1))
+    after = snapshot(algorithm)
+    assert not moved(before, after, "actor_network")
+    assert moved(before, after, "target_qvalue_network")
+
+
 def test_the_temperature_falls_while_the_policy_is_more_random_than_it_has_to_be():
     algorithm = build("sac")
     metrics = [algorithm.update(batch(seed)) for seed in range(5)]

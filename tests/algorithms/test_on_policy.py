@@ -144,6 +144,14 @@ def test_an_update_changes_the_weights_and_reports_what_matters():
     } <= set(metrics)
 
 
+def test_no_step_follows_a_gradient_longer_than_its_largest_norm():
+    actor, critic, batch = small_batch()
+    algorithm = build(actor, critic, 32, "algo.max_grad_norm=1e-3")
+    assert algorithm.update(batch)["grad_norm"] > 1e-2
+    followed = [parameter.grad for parameter in algorithm.loss.parameters()]
+    assert float(torch.cat([gradient.flatten() for gradient in followed]).norm()) == pytest.approx(1e-3, rel=1e-3)
+
+
 def test_the_learning_rate_falls_along_its_schedule():
     actor, critic, batch = small_batch()
     algorithm = build(actor, critic, 32, "total_frames=64", "algo.optimizer.lr=0.01", "algo.scheduler.end_factor=0.5")

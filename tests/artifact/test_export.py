@@ -135,6 +135,16 @@ def test_what_does_not_pass_the_gate_leaves_the_old_files_as_they_were(copied, m
     assert {path: path.read_bytes() for path in copied.glob("policy.*")} == before
 
 
+def test_a_policy_whose_hash_could_not_be_written_lies_beside_none_and_not_beside_the_old_one(tmp_path):
+    path = tmp_path / "policy.pt"
+    module._publish(path, b"old")
+    (tmp_path / ".policy.pt.sha256.tmp").mkdir()  # which the hash would be written to
+    with pytest.raises(OSError, match="sha256"):
+        module._publish(path, b"new")
+    assert path.read_bytes() == b"new"
+    assert not path.with_name("policy.pt.sha256").exists()
+
+
 def test_a_file_for_joints_in_another_order_is_refused_before_it_is_written(copied, monkeypatch):
     for path in copied.glob("policy.*"):
         path.unlink()

@@ -167,6 +167,17 @@ def test_a_vector_env_restarts_an_episode_at_the_step_after_its_end(make, name):
         np.testing.assert_array_equal(observations[1][row, 6:], first[row, 6:])
 
 
+def test_a_vector_env_that_is_reset_when_episodes_are_over_plays_the_new_ones_from_its_first_step_on(make):
+    env = make(IDS[0], 2, overrides=["env.task.max_steps=2", "env.task.tolerance=1e-6"])
+    env.reset(seed=0)
+    env.step(np.zeros((2, 2), np.float32))
+    assert env.step(np.zeros((2, 2), np.float32))[3].all()
+    first, _ = env.reset()
+    observation, reward, *_ = env.step(np.zeros((2, 2), np.float32))
+    np.testing.assert_array_equal(observation[:, 6:], first[:, 6:])
+    assert (reward < 0).all()
+
+
 def test_arrays_of_a_vector_env_are_not_changed_by_later_steps(make):
     env = make(IDS[0], 3, overrides=["env.task.max_steps=3"])
     kept = [env.reset(seed=0)[0]]

@@ -87,6 +87,15 @@ def test_a_joint_whose_urdf_names_no_axis_turns_about_x_as_pybullet_has_it(reach
     np.testing.assert_allclose(found, link_positions(spec, joint_position.numpy()), rtol=0, atol=1e-5)
 
 
+def test_only_the_direction_of_a_joint_s_axis_counts(reacher, tmp_path):
+    path = tmp_path / "arm.urdf"
+    path.write_text(resolve(reacher.robot.urdf).read_text().replace('<axis xyz="0 0 1"/>', '<axis xyz="0 0 2"/>'))
+    spec = RobotSpec.from_config(reacher.robot.model_copy(update={"urdf": str(path)}))
+    joint_position = random_positions(20, 2)
+    expected = ForwardKinematics(RobotSpec.from_config(reacher.robot))(joint_position)
+    assert torch.equal(ForwardKinematics(spec)(joint_position), expected)
+
+
 def test_all_seven_joints_of_the_kuka_match_pybullet(kuka_reacher):
     spec = first_joints(kuka_reacher.robot, 7)
     joint_position = random_positions(200, 7)

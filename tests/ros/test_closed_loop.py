@@ -1,8 +1,15 @@
 """The inference node and the virtual robot, each in its own process."""
 
-import pytest
+import time
 
-from tests.ros.peer import node_command
+import numpy as np
+import pytest
+from sensor_msgs.msg import JointState
+
+from physai.deploy import load_policy
+from tests.ros.forge import forged
+from tests.ros.loop import FAR, Arm
+from tests.ros.peer import Peer, free_domain, node_command
 
 
 def reach_goal_after_goal(start, peer, policy_path):
@@ -20,6 +27,30 @@ def reach_goal_after_goal(start, peer, policy_path):
 @pytest.mark.slow
 def test_the_arm_reaches_goal_after_goal(start, peer, policy_path):
     reach_goal_after_goal(start, peer, policy_path)
+
+
+def test_each_joint_is_commanded_at_its_place_and_one_that_is_not_the_policy_s_stands_still(policy_path):
+    with free_domain() as domain:
+        peer = Peer(domain)
+        states = peer.publisher(JointState, "/joint_states")
+
+        def tell() -> None:
+            message = JointState(name=Arm.NAMES, position=Arm.HOME, velocity=[0.0, 0.0])
+            message.header.stamp.sec, message.header.stamp.nanosec = divmod(time.time_ns(), 10**9)
+            states.publish(message)
+
+        peer.node.create_timer(0.01, tell)
+        joints = {"joints": "[gripper, joint2, joint1]", "goal": list(FAR)}
+        node = forged("inference_node", domain, policy_path=policy_path, autostart=True, **joints)
+        try:
+            peer.moved(commands=1)
+            gripper, *others = next(command for _, command in peer.commands if any(command))
+            wanted = load_policy(policy_path)(Arm.HOME, [0.0, 0.0], FAR)[::-1]
+            assert gripper == 0.0
+            np.testing.assert_allclose(others / np.abs(others).max(), wanted / np.abs(wanted).max(), atol=1e-5)
+        finally:
+            node.end()
+            peer.close()
 
 
 @pytest.mark.slow

@@ -6,8 +6,13 @@ import time
 from array import array
 
 import pytest
+import rclpy
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.parameter import Parameter
+from rclpy.signals import SignalHandlerOptions
 from std_msgs.msg import Empty, Float64MultiArray
 
+from physai.ros.command_watchdog import CommandWatchdog
 from tests.ros.forge import forged
 from tests.ros.peer import TOPIC, Peer, free_domain, wait_for
 
@@ -126,6 +131,35 @@ def test_what_waited_while_the_watchdog_stood_still_is_not_passed_on(watchdog):
         moving = [at for at, moves in after if moves]
         assert len(moving) <= 1  # which it was just sending when it was stopped
         assert next(at for at, moves in after if not moves) - max([since, *moving]) < 0.05
+
+
+@pytest.mark.realtime
+def test_a_command_that_has_waited_counts_from_when_it_came():
+    with free_domain() as domain:
+        peer = Peer(domain)
+        rclpy.init(domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
+        node, executor = CommandWatchdog(), SingleThreadedExecutor()
+        try:
+            executor.add_node(node)
+            node.set_parameters([Parameter("timeout", value=1.0)])
+
+            def there() -> bool:
+                if node.count_subscribers("/command_watchdog/commands"):
+                    send(peer, 0.1, 0.2)
+                executor.spin_once(0.02)
+                return bool(peer.commands) and peer.commands[-1][1] == [0.1, 0.2]
+
+            wait_for(there, what="a command behind the watchdog")
+            since = send(peer, 0.1, 0.2)
+            time.sleep(0.8)  # something else keeps the node busy
+            while not any(at > since and not any(velocity) for at, velocity in peer.commands):
+                executor.spin_once(0.02)
+            assert 0.95 < peer.first_zeros(after=since) < 1.4
+        finally:
+            executor.shutdown()
+            node.destroy_node()
+            rclpy.shutdown()
+            peer.close()
 
 
 def test_without_a_controller_it_listens_to_nobody():

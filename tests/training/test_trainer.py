@@ -163,6 +163,27 @@ def test_more_goals_than_robots_are_evaluated_in_rounds(evaluating, monkeypatch)
     assert evaluation._env.simulation.num_envs == 8
 
 
+def test_after_a_resume_a_policy_worse_than_the_best_before_does_not_take_its_place(evaluating):
+    trainer, evaluation = evaluating()
+    batch = torch.zeros(16, 64)
+    evaluation.after_batch(trainer, batch, {})
+    best = trainer.folder.best.read_bytes()
+    evaluation.set_state({"best": [1.0, 1000.0], "best_frames": 7})
+    evaluation.after_batch(trainer, batch, {})
+    assert trainer.folder.best.read_bytes() == best
+    assert evaluation.state() == {"best": [1.0, 1000.0], "best_frames": 7}
+
+
+def test_each_evaluation_normalizes_with_the_statistics_of_its_moment(evaluating):
+    trainer, evaluation = evaluating("evaluation.goals=2")
+    statistics = trainer.agent.statistics
+    for shift in (0.0, 5.0):
+        statistics.update(torch.randn(100, 8) + shift)
+        evaluation._evaluate(trainer)
+        assert torch.equal(evaluation._env.normalizer.loc, statistics.normalizer.loc)
+        assert torch.equal(evaluation._env.normalizer.scale, statistics.normalizer.scale)
+
+
 def test_resuming_a_complete_run_shows_its_result(small_run, capsys):
     run = small_run
     before = digest(run)
