@@ -67,6 +67,7 @@ def finished(tmp_path_factory):
     return run
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("frames", [4096, 6144])  # in the middle of what the robots remember
 def test_it_goes_on_from_any_checkpoint_bit_for_bit(finished, tmp_path, frames):
     shutil.copytree(finished, tmp_path / "run")
