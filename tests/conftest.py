@@ -8,6 +8,10 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+# Workers of pytest have a core each. Libraries read this when they are imported, also in processes that tests start.
+for library in ("OMP", "MKL", "OPENBLAS"):
+    os.environ[f"{library}_NUM_THREADS"] = "1"
+
 import pytest
 import torch
 from filelock import FileLock

@@ -20,6 +20,7 @@ TINY = (
     "collector.num_envs=16",
     "collector.frames_per_batch=512",
     "algo.minibatch_size=128",
+    "export=[]",
 )
 SWEEP = ("-m", *TINY, "hydra.sweep.dir=sweep")
 

@@ -37,11 +37,12 @@ SHM = Path("/dev/shm")
 TOPIC = controller_topic(Quantity.JOINT_VELOCITY)
 
 
-def wait_for(condition: Callable[[], Any], timeout: float = 20.0, what: str = "") -> Any:
-    """Return what the condition returns as soon as it is true."""
+def wait_for(condition: Callable[[], Any], timeout: float = 20.0, what: str | Callable[[], str] = "") -> Any:
+    """Return what the condition returns as soon as it is true; ``what`` may be asked once it is too late."""
     end = time.monotonic() + timeout
     while not (result := condition()):
-        assert time.monotonic() < end, f"waited {timeout} s in vain: {what or condition}"
+        late = time.monotonic() >= end
+        assert not late, f"waited {timeout} s in vain: {(what() if callable(what) else what) or condition}"
         time.sleep(0.002)
     return result
 
@@ -216,7 +217,12 @@ class Peer:
             last = self.states[-1] if self.states else None
             return last if last and last[1] in names and last[0] >= after else None
 
-        return wait_for(there, timeout, f"state {names}; had {self.states[-5:]}")
+        def instead() -> str:
+            joints = [(at, list(message.position)) for at, message in self.joint_states[-1:]]
+            heard = f"{len(self.commands)} commands, {len(self.joint_states)} joint states"
+            return f"state {names}; had {self.states[-5:]}; {heard}, the last {self.commands[-1:]}, {joints}"
+
+        return wait_for(there, timeout, instead)
 
     def set_parameters(self, node: str, **values: Any) -> list[SetParametersResult]:
         """Ask a node to change parameters, each for itself."""

@@ -76,6 +76,14 @@ def resume_here(run: Path) -> None:
     run_training(load_config(run), run, resume=True)
 
 
+def forget_after(run: Path, frames: int) -> None:
+    """Leave of a complete run what it would have been found with, had it been killed right after its last batch."""
+    later = [path for path in (run / "checkpoints").glob("0*.pt") if int(path.stem) > frames]
+    assert later
+    for path in (*later, run / "checkpoints" / "best.pt", run / "summary.json"):
+        path.unlink()
+
+
 def assert_same_run(ours: Path, theirs: Path) -> None:
     """See that two complete runs are one, to the last bit."""
     first, second = (json.loads((run / "summary.json").read_text()) for run in (ours, theirs))

@@ -1,15 +1,12 @@
 """Training from a replay buffer: random actions first, and going on from any moment bit for bit, buffer included."""
 
-import json
 import shutil
-import signal
-import time
 
 import pytest
 import torch
 
 from physai.training.agent import Agent
-from tests.training.small import SMALL, command, metrics, resume_here, small_config, train_here
+from tests.training.small import SMALL, assert_same_run, forget_after, resume_here, run_here, small_config
 
 OFF_POLICY = (
     "algo=sac",
@@ -25,9 +22,9 @@ OFF_POLICY = (
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("off_policy")
-    agent = train_here(small_config(*OFF_POLICY), folder)
-    return folder, agent.weights_sha256()
+    run = tmp_path_factory.mktemp("off_policy") / "run"
+    run_here(run, *OFF_POLICY)
+    return run
 
 
 def test_the_actions_of_the_warm_up_are_random_and_later_ones_are_the_policys():
@@ -46,28 +43,7 @@ def test_the_actions_of_the_warm_up_are_random_and_later_ones_are_the_policys():
 
 @pytest.mark.parametrize("frames", [1024, 2048, 5120])  # in the warm-up, right after it, and when the buffer is full
 def test_it_goes_on_from_any_checkpoint_bit_for_bit(finished, tmp_path, frames):
-    whole, digest = finished
-    shutil.copytree(whole, tmp_path / "run")
-    later = [path for path in (tmp_path / "run" / "checkpoints").glob("0*.pt") if int(path.stem) > frames]
-    assert later
-    for path in later:
-        path.unlink()
-    agent = train_here(small_config(*OFF_POLICY), tmp_path / "run", resume=True)
-    assert agent.weights_sha256() == digest
-    assert metrics(tmp_path / "run") == metrics(whole)
-    assert (tmp_path / "run" / "episodes.csv").read_bytes() == (whole / "episodes.csv").read_bytes()
-
-
-@pytest.mark.slow
-def test_killed_and_resumed_it_ends_like_the_uninterrupted_run(finished, tmp_path):
-    process = command("train", *OFF_POLICY, "hydra.run.dir=run", cwd=tmp_path)
-    while not (tmp_path / "run" / "metrics.csv").is_file() or len(metrics(tmp_path / "run")) < 4:
-        assert process.poll() is None
-        time.sleep(0.01)
-    process.send_signal(signal.SIGKILL)
-    assert process.wait() == -signal.SIGKILL
+    shutil.copytree(finished, tmp_path / "run")
+    forget_after(tmp_path / "run", frames)
     resume_here(tmp_path / "run")
-    whole, digest = finished
-    assert json.loads((tmp_path / "run" / "summary.json").read_text())["weights_sha256"] == digest
-    assert metrics(tmp_path / "run") == metrics(whole)
-    assert (tmp_path / "run" / "episodes.csv").read_bytes() == (whole / "episodes.csv").read_bytes()
+    assert_same_run(tmp_path / "run", finished)

@@ -1,7 +1,6 @@
 """Training a policy that remembers: its own ratio is one, and it goes on from any moment bit for bit."""
 
-import signal
-import time
+import shutil
 
 import pytest
 import torch
@@ -10,8 +9,7 @@ from physai.training.agent import Agent
 from tests.training.small import (
     SMALL,
     assert_same_run,
-    command,
-    metrics,
+    forget_after,
     resume_here,
     run_here,
     small_config,
@@ -62,14 +60,17 @@ def test_one_seed_gives_one_run(tmp_path):
     assert hashes[0] == hashes[1]
 
 
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    run = tmp_path_factory.mktemp("recurrent") / "run"
+    run_here(run, *RECURRENT)
+    return run
+
+
 @pytest.mark.slow
-def test_killed_and_resumed_it_ends_like_the_uninterrupted_run(tmp_path):
-    run_here(tmp_path / "whole", *RECURRENT)
-    process = command("train", *RECURRENT, "hydra.run.dir=killed", cwd=tmp_path)
-    while not (tmp_path / "killed" / "metrics.csv").is_file() or len(metrics(tmp_path / "killed")) < 5:
-        assert process.poll() is None
-        time.sleep(0.01)
-    process.send_signal(signal.SIGKILL)
-    assert process.wait() == -signal.SIGKILL
-    resume_here(tmp_path / "killed")
-    assert_same_run(tmp_path / "killed", tmp_path / "whole")
+@pytest.mark.parametrize("frames", [4096, 6144])  # in the middle of what the robots remember
+def test_it_goes_on_from_any_checkpoint_bit_for_bit(finished, tmp_path, frames):
+    shutil.copytree(finished, tmp_path / "run")
+    forget_after(tmp_path / "run", frames)
+    resume_here(tmp_path / "run")
+    assert_same_run(tmp_path / "run", finished)
