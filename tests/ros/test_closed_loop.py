@@ -24,6 +24,7 @@ def reach_goal_after_goal(start, peer, policy_path):
     assert max(abs(v) for _, command in peer.commands for v in command) <= 1.0 + 1e-9
 
 
+@pytest.mark.realtime  # at 1 rad/s, a busy computer makes the arm pass its goal
 @pytest.mark.slow
 def test_the_arm_reaches_goal_after_goal(start, peer, policy_path):
     reach_goal_after_goal(start, peer, policy_path)
