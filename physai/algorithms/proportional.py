@@ -19,8 +19,8 @@ class ProportionalSampler(Sampler):
 
     New frames have the highest priority that there was. Importance weights, ``(n p) ** -beta`` in units of the largest
     one drawn, are handed out as ``priority_weight``, which TorchRL's losses take. (TorchRL's ``PrioritizedSampler``
-    keeps its priorities in a tree, for draws of one minibatch; here one draw serves a whole batch of gradient steps,
-    for which a cumulative sum is as quick, and it needs no compiled part.)
+    keeps its priorities in a compiled tree, and that of TorchRL 0.14.1 does not load with PyTorch 2.13. Here one draw
+    serves a whole batch of gradient steps, and for that a cumulative sum is quick enough.)
 
     Args:
         alpha: How much priorities count; 0 draws uniformly.
