@@ -27,6 +27,8 @@ def run(tmp_path, monkeypatch, capsys):
         monkeypatch.setattr(sys, "argv", [f"physai.{module}", *arguments])
         monkeypatch.setenv("COLUMNS", "200")
         GlobalHydra.instance().clear()
+        for name in (f"physai.{module}", f"physai.{module}.__main__"):
+            monkeypatch.delitem(sys.modules, name, raising=False)  # no second copy of it
         try:
             runpy.run_module(f"physai.{module}", run_name="__main__")
             code = 0
