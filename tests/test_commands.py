@@ -126,6 +126,7 @@ BAD_TRAINING = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", BAD_TRAINING)
 def test_train_refuses_in_one_line_before_anything_exists(run, tmp_path, case):
     arguments, message = BAD_TRAINING[case]
@@ -203,6 +204,7 @@ class Heard(Callback):
         return super().__getattribute__(name)
 
 
+@pytest.mark.slow
 def test_a_run_leaves_hydras_files_and_tells_its_callbacks(run, tmp_path):
     Heard.events.clear()
     callback = f"+hydra.callbacks.heard._target_={__name__}.Heard"
@@ -309,6 +311,7 @@ def test_the_other_commands_refuse_in_one_line_too(run, copied, module, argument
 SHORT = ("env=reacher", "env.task.max_steps=40")  # pictures take their time
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "magic", "env"), [("arm.gif", b"GIF89a", SHORT), ("arm.mp4", b"ftyp", ())])
 def test_play_writes_a_video(run, copied, tmp_path, name, magic, env):
     code, output, error = run("play", "run=run", f"output={name}", "goals=1", *env)

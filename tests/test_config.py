@@ -43,6 +43,7 @@ def small(*overrides: str) -> TrainConfig:
     return validate(TrainConfig, compose("train", [*overrides, *SMALL, *minibatch]))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "overrides",
     [[f"{group}={name}"] for group in ("env", "algo", "randomization", "logger") for name in choices(group)]

@@ -72,6 +72,7 @@ def test_forty_ways_to_run_code_and_more():
     assert len(malicious.EVALUATE) + len(malicious.RESUME) + len(malicious.PLOT) >= 40
 
 
+@pytest.mark.slow
 def test_the_same_folder_without_a_payload_is_read_resumed_and_drawn(run):
     evaluate(run)
     plot_runs([run], run / "training.png")
@@ -106,6 +107,7 @@ def test_the_other_commands_ask_before_anything_else(run, monkeypatch, capsys, m
     assert "may not name 'evil.Thing'" in refused(capsys, cli.main, module, job, found._check)
 
 
+@pytest.mark.slow
 def test_resume_refuses_a_module_of_the_working_directory(run):
     malicious.edit(run, malicious.EVALUATE["a module beside the run"])
     process = command("train", "resume=run", cwd=Path.cwd())
@@ -171,6 +173,7 @@ def test_a_run_of_ones_own_parts_is_judged_and_exported_where_it_was_trained(own
     assert exported == [config]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "choice",
     [f"{group}={path.stem}" for group in ("algo", "collector", "logger", "policy", "randomization")

@@ -51,6 +51,7 @@ def test_help_imports_nothing_that_trains(tmp_path):
     assert last_line(AT_HELP, "--help", cwd=tmp_path) == "[]"
 
 
+@pytest.mark.slow
 def test_before_the_first_frame_nothing_is_built_twice_and_nothing_imported_that_draws_or_exports(tmp_path):
     assert last_line(AT_THE_FIRST_FRAME, *SMALL, "hydra.run.dir=run", cwd=tmp_path) == "[] 1"
 
@@ -84,6 +85,7 @@ def test_what_was_checked_is_what_a_run_trains(training, tmp_path):
     assert trained[1] is None  # random numbers have been drawn since
 
 
+@pytest.mark.slow
 def test_the_jobs_of_a_sweep_build_their_own_and_its_check_keeps_no_robots(training, monkeypatch, tmp_path):
     command, trained = training(keep=False)
     built, build = [], Agent.build

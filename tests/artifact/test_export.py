@@ -145,6 +145,7 @@ def test_a_policy_whose_hash_could_not_be_written_lies_beside_none_and_not_besid
     assert not path.with_name("policy.pt.sha256").exists()
 
 
+@pytest.mark.slow
 def test_a_file_for_joints_in_another_order_is_refused_before_it_is_written(copied, monkeypatch):
     for path in copied.glob("policy.*"):
         path.unlink()
@@ -163,6 +164,7 @@ def test_a_file_for_joints_in_another_order_is_refused_before_it_is_written(copi
     assert not list(copied.glob("policy.*"))
 
 
+@pytest.mark.slow
 def test_only_the_asked_form_is_written(copied):
     for path in copied.glob("policy.*"):
         path.unlink()
@@ -171,6 +173,7 @@ def test_only_the_asked_form_is_written(copied):
     assert metadata_of(copied)["checkpoint"]["which"] == "last"
 
 
+@pytest.mark.slow
 def test_each_stage_is_reported(copied):
     stages = []
     export_policy(copied, "best", ["onnx"], lambda stage, result: stages.append(f"{stage}: {result}"), episodes=8)
@@ -179,6 +182,7 @@ def test_each_stage_is_reported(copied):
         assert part in text
 
 
+@pytest.mark.slow
 def test_onnx_metadata_that_are_not_those_of_the_policy_are_refused(copied, monkeypatch):
     described = module.onnx.describe
     monkeypatch.setattr(module.onnx, "describe", lambda content, text: described(content, text.replace("joint1", "x")))

@@ -269,6 +269,7 @@ def test_a_number_that_is_not_finite_is_a_difference(trained):
         gate.compare("stage", "command", expected[:3], expected, states)
 
 
+@pytest.mark.slow
 def test_a_fresh_process_without_physai_gives_the_same_bits(trained):
     actor, env, _, states = trained
     policy = make_deployable(actor, env)
@@ -278,11 +279,13 @@ def test_a_fresh_process_without_physai_gives_the_same_bits(trained):
     assert all(torch.equal(found[key], expected[key]) for key in expected)
 
 
+@pytest.mark.slow
 def test_a_file_that_a_fresh_process_cannot_run_is_refused(trained):
     with pytest.raises(gate.GateError, match="a fresh process without physai cannot run the file"):
         gate.ask_fresh_process(b"not a file of torch", make_deployable(*trained[:2]), trained[3])
 
 
+@pytest.mark.slow
 def test_onnx_agrees_and_what_is_planted_in_it_is_found(trained):
     actor, env, _, states = trained
     policy = make_deployable(actor, env)

@@ -115,6 +115,7 @@ def test_what_is_planted_in_its_memory_is_found_and_named(trained, plant, what):
         gate.check_recurrence({"the artifact": (policy, 0.0)}, gate.acting(actor, env), policy, states)
 
 
+@pytest.mark.slow
 def test_all_stages_of_the_gate_see_its_memory(trained):
     actor, env, rollout, states = trained
     policy = make_deployable(actor, env)

@@ -38,6 +38,7 @@ def test_the_first_frames_have_random_actions_and_the_keys_of_all_others(collect
     assert 0.5 < drawn.std() < 0.65  # of a uniform distribution, 0.58
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["single", "async", "multi_sync", "multi_async"])
 def test_random_frames_of_before_a_checkpoint_count_after_it(collect, kind):
     first, *_ = collect(kind, warmup=256, std=0.01)

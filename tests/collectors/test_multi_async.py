@@ -40,6 +40,7 @@ def test_batches_are_whole_and_processes_take_turns(collect):
     assert len(goals) == 8  # no two robots alike
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_batches_whoever_is_faster(collect):
     runs = []
     for late in (0, 1):
@@ -98,6 +99,7 @@ def test_a_loop_that_is_left_goes_on_in_the_next_as_if_it_had_not_been(collect, 
         parts.assert_equal(one, same)
 
 
+@pytest.mark.slow
 @KINDS
 def test_state_continues_bit_for_bit_in_new_processes(collect, kind):
     expected = learn(*collect(kind, seed=3))

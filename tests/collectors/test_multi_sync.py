@@ -53,6 +53,7 @@ def test_a_worker_that_is_gone_when_it_is_asked_for_its_state_is_an_error_of_one
         source.state()
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_frames(collect):
     (first, *_), (again, *_), (other, *_) = (collect("multi_sync", seed=seed) for seed in (1, 1, 2))
     for ours, theirs, _ in zip(first, again, range(2), strict=False):
@@ -102,6 +103,7 @@ def is_alive(pid):
         return False
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="a signal at the death of the parent is Linux's")
 @pytest.mark.parametrize("kind", ["multi_sync", "multi_async"])
 def test_workers_die_with_a_learner_that_is_killed(kind):

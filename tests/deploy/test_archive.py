@@ -65,6 +65,7 @@ def mutations(content: bytes, seed: int, count: int) -> Iterator[tuple[str, byte
         yield f"{i}: {how} at {at} ({part})", bytes(damaged)
 
 
+@pytest.mark.slow
 def test_damage_anywhere_is_refused_or_changes_no_bit_of_any_command(content, path, policy):
     refused = 0
     for what, damaged in mutations(content, seed=0, count=350):
@@ -264,6 +265,7 @@ def test_a_policy_with_a_long_name_loads(content, tmp_path):
 AS_NOBODY = f"import os\nimport physai.deploy.policy\nif os.geteuid() == 0:\n    os.setuid(65534)\n{LOAD}"
 
 
+@pytest.mark.slow
 def test_a_file_that_may_not_be_read_is_refused(content):
     with tempfile.TemporaryDirectory() as folder:
         secret, locked = Path(folder) / "secret.pt", Path(folder) / "locked" / "policy.pt"

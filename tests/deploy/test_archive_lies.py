@@ -213,6 +213,7 @@ def test_what_torch_reads_is_what_was_checked(content, awakened, path, marker, h
 # --- weights that are too short
 
 
+@pytest.mark.slow
 def test_a_forged_file_with_too_little_data_for_its_weights_is_refused(content, tmp_path):
     good, paths = records(content), []
     for i, size in enumerate([0, 1]):

@@ -191,6 +191,7 @@ print(*sorted({name.partition(".")[0] for name in sys.modules} & set(sys.argv[1:
 """
 
 
+@pytest.mark.slow
 def test_importing_it_imports_nothing_that_a_robot_lacks():
     heavy = ["tensordict", "torchrl", "pybullet", "hydra", "omegaconf", "pydantic", "gymnasium", "pandas", "scipy"]
     done = subprocess.run([sys.executable, "-c", IMPORTS, *heavy], capture_output=True, text=True, check=True)

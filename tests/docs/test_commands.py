@@ -22,6 +22,7 @@ BROUGHT = ("collector", "env", "experiment", "logger", "policy", "randomization"
 CONSOLE = {block.text.splitlines()[0]: block for block in blocks("console")}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("block", blocks("bash"), ids=str)
 def test_each_command_exists_and_takes_what_it_is_given(block):
     for words in commands(block.text):

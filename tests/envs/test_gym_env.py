@@ -247,6 +247,7 @@ def test_importing_physai_registers_the_ids_and_imports_nothing_heavy():
     )
 
 
+@pytest.mark.slow
 def test_a_gymnasium_env_needs_no_torchrl():
     in_fresh_python(
         "import sys, gymnasium, physai\n"
@@ -258,6 +259,7 @@ def test_a_gymnasium_env_needs_no_torchrl():
     )
 
 
+@pytest.mark.slow
 def test_nothing_of_a_viewer_is_imported_before_somebody_looks():
     in_fresh_python(
         "import sys, gymnasium, physai\n"
@@ -292,5 +294,6 @@ def test_a_robot_that_takes_positions_is_an_env_like_any_other(make, num_envs):
     assert (simulation.state.joint_position[:, 0] > before[:, 0]).all()
 
 
+@pytest.mark.slow
 def test_gymnasium_finds_the_env_by_the_module_in_its_name():
     in_fresh_python("import gymnasium; gymnasium.make('physai:physai/Reacher-v0').close()")

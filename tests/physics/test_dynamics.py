@@ -113,6 +113,7 @@ def wandering(spec, robots, random):
     return np.repeat(drawn, 10, axis=0)
 
 
+@pytest.mark.slow
 def test_a_velocity_gain_means_the_same_at_any_number_of_substeps(spec, make):
     # An effort limit that ends within a control period makes a difference by itself, which is not the gain's. Measured
     # with and without gains, RMS over 4 s: 1.7 and 1.1 mrad on the KUKA, 9.3 and 8.9 on the planar arm.

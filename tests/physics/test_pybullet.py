@@ -195,6 +195,7 @@ def test_closing_frees_all_worlds_and_may_happen_twice(planar):
     assert open_clients() == before
 
 
+@pytest.mark.slow
 def test_a_client_that_someone_else_opened_is_not_touched():
     script = """
 import numpy as np, pybullet as bullet

@@ -30,6 +30,7 @@ def test_the_arm_reaches_goal_after_goal(start, peer, policy_path):
     reach_goal_after_goal(start, peer, policy_path)
 
 
+@pytest.mark.slow
 def test_each_joint_is_commanded_at_its_place_and_one_that_is_not_the_policy_s_stands_still(policy_path):
     with free_domain() as domain:
         peer = Peer(domain)

@@ -46,6 +46,7 @@ def passes(peer: Peer, *velocity: float) -> None:
     wait_for(there, what=f"{velocity} behind the watchdog")
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 def test_silence_becomes_zeros_again_and_again(watchdog):
     for _ in range(5):
@@ -65,6 +66,7 @@ def test_nonsense_becomes_zeros(watchdog, nonsense):
     passes(watchdog, 0.1, 0.2)
 
 
+@pytest.mark.slow
 def test_another_commander_of_the_controller_stops_the_arm(watchdog):
     passes(watchdog, 0.1, 0.2)
     other = Peer(watchdog.domain)
@@ -162,6 +164,7 @@ def test_a_command_that_has_waited_counts_from_when_it_came():
             peer.close()
 
 
+@pytest.mark.slow
 def test_without_a_controller_it_listens_to_nobody():
     with free_domain() as domain:
         peer = Peer(domain, listen_to_commands=False)
@@ -180,6 +183,7 @@ def test_without_a_controller_it_listens_to_nobody():
             peer.close()
 
 
+@pytest.mark.slow
 def test_with_a_number_of_joints_zeros_come_from_the_start():
     with free_domain() as domain:
         peer = Peer(domain)
@@ -192,6 +196,7 @@ def test_with_a_number_of_joints_zeros_come_from_the_start():
             peer.close()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("nonsense", [(), (math.nan, 0.1)])
 def test_nonsense_does_not_tell_how_many_joints_there_are(nonsense):
     with free_domain() as domain:
@@ -218,6 +223,7 @@ def test_the_timeout_can_be_changed(watchdog):
         watchdog.set_parameters("/command_watchdog", timeout=TIMEOUT)
 
 
+@pytest.mark.slow
 def test_its_own_end_leaves_the_arm_standing():
     with free_domain() as domain:
         peer = Peer(domain)

@@ -63,6 +63,7 @@ def test_the_service_stops_the_arm_at_once_and_for_good(loop):
     stays_stopped(loop, since)
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 @pytest.mark.parametrize("profile", PROFILES.values(), ids=PROFILES)
 def test_a_false_that_follows_at_once_does_not_undo_it(loop, profile):
@@ -134,6 +135,7 @@ def test_one_that_was_pressed_before_the_node_started_counts(policy_path, peer):
         loop.peer.moved()
 
 
+@pytest.mark.slow
 @pytest.mark.fault("latched `/emergency_stop` is still true")
 def test_a_reset_is_refused_while_one_of_two_latched_stops_is_still_pressed(loop):
     other = Peer(loop.peer.domain)
@@ -185,6 +187,7 @@ def test_without_numbers_a_true_holds_until_all_are_asked_again(peer):
     wait_for(lambda: topic.held() is None, what="their answers")
 
 
+@pytest.mark.slow
 def test_a_true_that_is_not_latched_does_not_hold_the_stop(loop):
     loop.start()
     loop.peer.publish("/emergency_stop", Bool(data=True), PROFILES["reliable"])
@@ -192,6 +195,7 @@ def test_a_true_that_is_not_latched_does_not_hold_the_stop(loop):
     assert loop.peer.call("/inference_node/reset").success
 
 
+@pytest.mark.slow
 def test_it_is_taken_without_a_robot_and_without_being_enabled(policy_path):
     with closed_loop(policy_path, autostart=False) as loop:
         loop.arm.change = lambda message: None

@@ -42,6 +42,7 @@ def test_a_bad_goal_does_not_start_the_arm(loop):
     assert loop.diagnosis()[2]["goal"] == ""
 
 
+@pytest.mark.slow
 def test_a_goal_out_of_reach_is_moved_to_the_nearest_where_that_is_allowed(loop):
     loop.rest()
     (answer,) = loop.peer.set_parameters("/inference_node", unreachable_goal="project")

@@ -55,6 +55,7 @@ def test_another_commander_that_appears_ends_the_motion_for_good(loop):
     loop.peer.moved(after=since)
 
 
+@pytest.mark.slow
 def test_a_goal_sent_while_another_one_commands_is_not_kept(loop):
     since = loop.start()
     rival = loop.peer.node.create_publisher(Float64MultiArray, TOPIC, 1)
@@ -67,6 +68,7 @@ def test_a_goal_sent_while_another_one_commands_is_not_kept(loop):
     loop.peer.all_zeros(after=since, commands=20)
 
 
+@pytest.mark.slow
 def test_to_disable_it_leaves_zeros_also_when_another_one_has_just_come(loop):
     for wait in (0.0, 0.03, 0.06, 0.09, 0.12):
         loop.start()

@@ -116,6 +116,7 @@ def test_the_arm_moves_on(loop, change):
     assert loop.peer.states[-1][1] == "active"
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 @pytest.mark.parametrize("name", BAD)
 def test_the_arm_stops_counts_and_goes_on_by_itself(loop, name):
@@ -189,6 +190,7 @@ def test_that_jump_stop_the_arm_until_they_agree(loop):
     assert "position jump" in str(loop.diagnosis()[2])
 
 
+@pytest.mark.slow
 def test_of_an_arm_far_beyond_its_limit_are_a_fault_until_it_is_back_and_reset(loop):
     loop.start()
     loop.arm.position = [0.0, 2.85]
@@ -249,6 +251,7 @@ def gripper(loop, rate):
         loop.peer.node.destroy_publisher(publisher)
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 @pytest.mark.parametrize("rate", [50, 200])  # at 1,000 Hz, this process would be busy with them, too
 def test_of_an_arm_beside_a_gripper_move_it_as_if_it_were_alone(loop, rate):

@@ -81,6 +81,7 @@ def talk(lines: int, folder: Path, wait: float, **streams: int) -> tuple[subproc
     return subprocess.Popen([sys.executable, "-c", code], **streams), report
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 def test_lines_that_nobody_takes_are_counted_and_told_of_when_they_flow_again(tmp_path):
     reader, writer = os.pipe()
@@ -162,6 +163,7 @@ def test_a_node_stops_the_arm_all_the_same(policy_path, tmp_path, kind, reasons)
         assert time.monotonic() - since < 4.0
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 @pytest.mark.parametrize("kind", ["terminal", "pipe"])
 @pytest.mark.fault("output stopped, full or closed")

@@ -137,6 +137,7 @@ def test_ros_finds_an_installed_wheel(venv):
     assert module.is_relative_to(venv)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("executable", EXECUTABLES)
 def test_executables_run_in_their_venv(venv, executable):
     path = venv / "lib" / "physai" / executable

@@ -176,6 +176,7 @@ def test_a_lower_velocity_takes_effect_at_once_while_the_arm_moves(loop):
         loop.peer.set_parameters(NODE, max_velocity=0.3)
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 def test_bad_and_fixed_values_are_refused_while_the_arm_moves_and_change_nothing(loop):
     since = loop.start()
@@ -203,6 +204,7 @@ def test_bad_and_fixed_values_are_refused_while_the_arm_moves_and_change_nothing
     assert answer.successful, answer.reason
 
 
+@pytest.mark.slow
 def test_an_empty_list_of_the_command_line_is_the_empty_list(domain, start):
     node = start("virtual_robot", joints="[]", fault_nan=1)
     node.says("takes joint_velocity of ['joint1', 'joint2']")

@@ -195,6 +195,7 @@ def test_a_killed_recording_is_completed(start, peer, tmp_path):
     assert again.output == f"error: {bag} is complete"
 
 
+@pytest.mark.slow
 def test_a_full_disk_ends_a_recording_in_one_line(start, peer, tmp_path):
     bag = tmp_path / "bag"
 

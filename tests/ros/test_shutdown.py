@@ -62,6 +62,7 @@ def test_the_last_command_is_zero(policy_path):
             assert "Traceback" not in loop.node.output, name
 
 
+@pytest.mark.slow
 def test_a_node_that_never_had_a_say_ends_without_a_word(policy_path):
     with closed_loop(policy_path, autostart=False, goal=GOAL) as loop:
         loop.peer.wait_state("waiting")

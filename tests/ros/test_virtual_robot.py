@@ -104,6 +104,7 @@ def test_a_command_of_a_wrong_length_makes_it_deaf_until_a_reset(robot):
     robot.settles_at(0.3, 0.3)
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 def test_states_come_a_hundred_times_a_second_in_order(robot):
     since = time.monotonic()
@@ -157,6 +158,7 @@ def test_each_fault_can_be_switched_on_and_off_while_it_runs(robot):
     robot.state()
 
 
+@pytest.mark.slow
 def test_joints_are_commanded_and_shown_in_the_order_that_is_asked_for(other):
     robot = other(joints="[joint2, joint1]", state_joints="[gripper, joint1, lid, joint2]")
     robot.command(-0.2, 0.1)  # of joint2 and joint1

@@ -66,6 +66,7 @@ def test_the_node_stops_the_arm_of_a_watchdog_that_hangs_or_dies_and_goes_on_whe
     assert max(map(abs, first)) <= 0.05  # two periods of the acceleration limit at most
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 @pytest.mark.fault("node silent for the watchdog's `timeout` (0.1 s)")
 def test_the_watchdog_stops_the_arm_of_a_node_that_hangs(watched):
@@ -103,6 +104,7 @@ def test_a_third_commander_is_a_rival_of_both(watched):
     drive(watched)
 
 
+@pytest.mark.slow
 def test_another_commander_of_the_watchdog_is_a_rival_of_the_node(watched):
     drive(watched)
     rival = watched.peer.node.create_publisher(Float64MultiArray, f"{NAME}/commands", 1)

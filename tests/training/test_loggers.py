@@ -20,6 +20,7 @@ def log(config, run, frames):
     return logger
 
 
+@pytest.mark.slow
 def test_mlflow_keeps_config_and_metrics_and_a_resumed_run_goes_on_there(tmp_path):
     mlflow = pytest.importorskip("mlflow")
     config = small_config("logger=mlflow", "algo.optimizer.lr=0.002")
@@ -34,6 +35,7 @@ def test_mlflow_keeps_config_and_metrics_and_a_resumed_run_goes_on_there(tmp_pat
     assert [(point.step, point.value) for point in history] == [(10, 5.0), (20, 10.0)]
 
 
+@pytest.mark.slow
 def test_mlflow_takes_a_database_that_runs_share(tmp_path):
     mlflow = pytest.importorskip("mlflow")
     shared = f"sqlite:///{tmp_path}/shared.db"
@@ -45,6 +47,7 @@ def test_mlflow_takes_a_database_that_runs_share(tmp_path):
     assert sorted(run.info.run_name for run in runs) == [f"{tmp_path}/a", f"{tmp_path}/b"]
 
 
+@pytest.mark.slow
 def test_wandb_keeps_config_and_metrics_and_a_resumed_run_has_the_same_id(tmp_path):
     pytest.importorskip("wandb")
     config = small_config("logger=wandb", "logger.offline=true")

@@ -41,6 +41,7 @@ def test_the_actions_of_the_warm_up_are_random_and_later_ones_are_the_policys():
     assert actions[2].min() > 0.98
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("frames", [1024, 2048, 5120])  # in the warm-up, right after it, and when the buffer is full
 def test_it_goes_on_from_any_checkpoint_bit_for_bit(finished, tmp_path, frames):
     shutil.copytree(finished, tmp_path / "run")

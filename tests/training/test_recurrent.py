@@ -51,6 +51,7 @@ def test_it_learns_from_whole_sequences_each_once_an_epoch(monkeypatch):
     assert not torch.equal(*epochs)
 
 
+@pytest.mark.slow
 def test_one_seed_gives_one_run(tmp_path):
     hashes = []
     for name in ("one", "two"):

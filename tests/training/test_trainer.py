@@ -66,6 +66,7 @@ def test_a_run_folder_tells_its_whole_story(small_run):
     } <= set(events.Tags()["scalars"])
 
 
+@pytest.mark.slow
 def test_one_seed_gives_one_run_and_another_seed_another(small_run, tmp_path):
     run = small_run
     same, other = tmp_path / "same", tmp_path / "other"
@@ -204,6 +205,7 @@ def test_a_loss_that_explodes_stops_the_run_and_keeps_the_evidence(tmp_path):
     assert all(torch.isfinite(value).all() for value in weights.values())
 
 
+@pytest.mark.slow
 def test_a_simulation_that_is_not_finite_stops_the_run(tmp_path, monkeypatch):
     from physai.envs.simulation import Simulation
 
@@ -245,6 +247,7 @@ except UserError as error:
 """
 
 
+@pytest.mark.slow
 def test_a_full_disk_ends_the_run_in_one_line_with_the_last_good_checkpoint_kept(tmp_path, pytestconfig):
     import subprocess
     import sys
