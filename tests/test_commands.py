@@ -218,6 +218,7 @@ def test_a_run_leaves_hydras_files_and_tells_its_callbacks(run, tmp_path):
     assert hydra.runtime.output_dir == str(tmp_path / "here")
 
 
+@pytest.mark.slow
 def test_a_second_run_does_not_overwrite_the_first(run, copied):
     before = (copied / "summary.json").read_bytes()
     code, _, error = run("train", *SMALL, "hydra.run.dir=run")
@@ -236,6 +237,7 @@ def test_resume_refuses_a_run_whose_checkpoints_are_gone(run, copied):
     assert (copied / "metrics.csv").read_bytes() == before
 
 
+@pytest.mark.slow
 def test_a_second_sweep_does_not_overwrite_the_first(run, copied, tmp_path):
     shutil.copytree(copied, tmp_path / "sweep" / "0")
     code, _, error = run("train", "-m", *SMALL, "seed=0,1", "hydra.sweep.dir=sweep")
@@ -243,6 +245,7 @@ def test_a_second_sweep_does_not_overwrite_the_first(run, copied, tmp_path):
     assert "sweep holds a run already: choose another hydra.sweep.dir" in error
 
 
+@pytest.mark.slow
 def test_evaluate_says_how_sure_it_is_and_which_randomization_it_used(run, copied):
     code, output, _ = run("evaluate", "run=run", "episodes=50", "randomization=strong")
     assert code == 0

@@ -66,6 +66,7 @@ def test_every_choice_builds_and_collects(overrides):
     agent.close()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("robot", choices("robot"))
 @pytest.mark.parametrize("command", ["joint_velocity", "joint_position"])
 def test_every_robot_can_be_driven_by_velocities_and_by_positions(robot, command):

@@ -153,6 +153,7 @@ def test_a_package_that_is_allowed_is_no_bridge_to_others(own, name):
         load_config(own, ["mypackage"])
 
 
+@pytest.mark.slow
 def test_what_the_user_types_beside_resume_is_the_users_own(own):
     train._resume(own, ["env.task._target_=mypackage.Mine"])
     assert (own / "summary.json").is_file()
@@ -163,6 +164,7 @@ def test_what_the_user_types_must_be_what_the_run_folder_says(own, capsys):
     assert "may not name 'mypackage.Mine'" in error
 
 
+@pytest.mark.slow
 def test_a_run_of_ones_own_parts_is_judged_and_exported_where_it_was_trained(own, monkeypatch):
     exported = []
     monkeypatch.setattr(artifact, "export_policy", lambda *_, config: exported.append(config))
@@ -244,6 +246,7 @@ def test_parts_that_a_contributor_would_use_pass(name):
     assert foreign.checked(names(name), Path("config.yaml")) == names(name)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NO_PARTS)
 def test_what_loads_starts_or_fetches_does_not(name):
     with pytest.raises(UserError, match=r"^config\.yaml: part\._target_: "):

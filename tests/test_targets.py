@@ -60,6 +60,7 @@ def test_what_cannot_be_used_is_named(name, message):
 KEYS = ["env.task", "env.physics", "algo", "algo.loss", "algo.buffer.sampler", "algo.optimizer", "policy.actor"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["bad_kinds.Other", "bad_kinds.fails", "torch.nn.Identity", "builtins.dict", 7])
 @pytest.mark.parametrize("key", KEYS)
 def test_a_part_of_another_kind_is_one_line(key, name):

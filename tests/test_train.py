@@ -47,6 +47,7 @@ def last_line(code, *arguments, cwd):
     return done.stdout.splitlines()[-1]
 
 
+@pytest.mark.slow
 def test_help_imports_nothing_that_trains(tmp_path):
     assert last_line(AT_HELP, "--help", cwd=tmp_path) == "[]"
 

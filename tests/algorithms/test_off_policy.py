@@ -235,6 +235,7 @@ def test_the_temperature_falls_while_the_policy_is_more_random_than_it_has_to_be
     assert temperatures[-1] < 0.195
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("swap", [(), ON_DISK, PRIORITIZED], ids=["ram", "disk", "prio"])
 @pytest.mark.parametrize("name", ALGORITHMS)
 @pytest.mark.parametrize("batches", [0, 2, 5])  # wrapped around after the third

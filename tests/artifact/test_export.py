@@ -97,6 +97,7 @@ def test_golden_pairs_are_full_precision_and_hold_in_both_forms(exported_run):
         np.testing.assert_allclose(command[0], golden["joint_velocity_command"][row], rtol=0, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_an_ideal_arm_reaches_twenty_goals_in_a_row_without_going_home(exported_run):
     arms, metadata = 64, read_metadata(exported_run / "policy.pt")
     lower, upper = torch.from_numpy(metadata.position_limit).float().T

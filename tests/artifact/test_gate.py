@@ -298,6 +298,7 @@ def test_onnx_agrees_and_what_is_planted_in_it_is_found(trained):
         gate.check_onnx(onnx.Runtime(onnx.convert(wrong, states)), policy, expected, states)
 
 
+@pytest.mark.slow
 def test_an_artifact_that_drives_worse_is_refused(trained):
     actor, env, _, _ = trained
     policy = make_deployable(actor, env)

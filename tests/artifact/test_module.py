@@ -126,6 +126,7 @@ def test_a_policy_that_commands_positions_moves_the_last_command_on():
     env.close()
 
 
+@pytest.mark.slow
 def test_policies_of_both_kinds_script_in_one_process_each_with_its_own_inputs():
     schemas = []
     for command in ("joint_velocity", "joint_position", "joint_velocity"):

@@ -9,6 +9,7 @@ from physai.bench.timing import reacher
 from physai.training.agent import Agent
 
 
+@pytest.mark.slow
 def test_ppo_by_hand_learns_what_algo_ppo_learns():
     # One minibatch: an order of samples cannot make a difference.
     config = reacher(0, "collector.num_envs=32", "collector.frames_per_batch=512", "algo.minibatch_size=512")

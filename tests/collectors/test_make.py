@@ -28,6 +28,7 @@ def random_ones(batches):
     return [bool(batch["action"].abs().max() > 0.5) for batch in batches]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["single", "async", "multi_sync", "multi_async"])
 def test_the_first_frames_have_random_actions_and_the_keys_of_all_others(collect, kind):
     batches = [batch.clone() for batch in collect(kind, warmup=200, std=0.01)[0]]

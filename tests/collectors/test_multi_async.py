@@ -31,6 +31,7 @@ def learn(source, actor, normalization, batches=None):
     return taken
 
 
+@pytest.mark.slow
 def test_batches_are_whole_and_processes_take_turns(collect):
     source, *_ = collect("multi_async", total=1000)
     batches = [batch.clone() for batch in source]
@@ -54,6 +55,7 @@ def test_the_same_seed_gives_the_same_batches_whoever_is_faster(collect):
         parts.assert_equal(one, other)
 
 
+@pytest.mark.slow
 @KINDS
 def test_one_set_of_weights_and_statistics_holds_for_a_whole_batch_and_misses_an_update_per_process(collect, kind):
     source, actor, normalization = collect(kind, total=2048)
@@ -79,6 +81,7 @@ def test_one_set_of_weights_and_statistics_holds_for_a_whole_batch_and_misses_an
     assert number == 15
 
 
+@pytest.mark.slow
 def test_asking_for_the_state_loses_no_frame(collect):
     source, *_ = collect("multi_async")
     batches = []
@@ -89,6 +92,7 @@ def test_asking_for_the_state_loses_no_frame(collect):
     assert all(goes_on(before, after) for before, after in zip(batches, batches[2:], strict=False))
 
 
+@pytest.mark.slow
 @KINDS
 def test_a_loop_that_is_left_goes_on_in_the_next_as_if_it_had_not_been(collect, kind):
     expected = learn(*collect(kind, seed=4))
@@ -117,6 +121,7 @@ def test_state_continues_bit_for_bit_in_new_processes(collect, kind):
         parts.assert_equal(one, same)
 
 
+@pytest.mark.slow
 def test_a_killed_worker_ends_collection_with_an_error_and_takes_the_others_along(collect):
     source, *_ = collect("multi_async", total=10**9)
     batches = iter(source)
@@ -129,6 +134,7 @@ def test_a_killed_worker_ends_collection_with_an_error_and_takes_the_others_alon
     assert time.monotonic() - started < 20
 
 
+@pytest.mark.slow
 def test_a_worker_that_is_gone_when_it_is_asked_for_its_state_is_an_error_of_one_line(collect):
     source, *_ = collect("multi_async", total=10**9)
     next(iter(source))

@@ -61,6 +61,7 @@ def test_the_same_seed_gives_the_same_frames(collect):
     assert not torch.isclose(next(iter(other))["goal"], ours["goal"]).any()
 
 
+@pytest.mark.slow
 def test_state_continues_bit_for_bit_in_new_processes(collect):
     source, _, normalization = collect("multi_sync", seed=3)
     batches = iter(source)
@@ -74,6 +75,7 @@ def test_state_continues_bit_for_bit_in_new_processes(collect):
     assert_equal(expected, next(iter(other)))
 
 
+@pytest.mark.slow
 def test_a_killed_worker_ends_collection_with_an_error_and_takes_the_others_along(collect):
     source, *_ = collect("multi_sync")
     batches = iter(source)

@@ -81,6 +81,7 @@ def test_records_that_would_be_larger_than_any_policy_are_refused_before_they_ar
     assert "impossibly large" in refusal(path)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("compression", [zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
 def test_a_zip_bomb_is_not_blown_up(content, path, compression):
     target = io.BytesIO(content)

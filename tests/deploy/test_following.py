@@ -154,6 +154,7 @@ def test_after_such_a_fault_a_reset_and_a_new_goal_start_anew(policy):
     assert {command.state for command in commands} == {State.ACTIVE}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("delay", [0, 3, 8], ids=["at once", "60 ms", "160 ms"])
 @pytest.mark.parametrize("speed", [0.1, 0.3, 1.0])
 def test_an_arm_that_follows_late_and_noisily_is_no_fault(policy, speed, delay):

@@ -355,6 +355,7 @@ states = st.builds(
 )
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")
 @given(st.lists(states, max_size=5))
 @example([JointState(NAMES, (0.0, 0.0), (), 0.0), JointState(NAMES, (1e-9, 0.0), (), 5e-324)])

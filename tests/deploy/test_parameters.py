@@ -198,6 +198,7 @@ plain = st.none() | st.booleans() | st.integers(-10, 10) | st.integers() | st.fl
 anything = plain | st.sampled_from(["slow", "fast", 10**400]) | st.lists(plain, max_size=3)
 
 
+@pytest.mark.slow
 @given(st.dictionaries(st.sampled_from(list(OTHERS)), anything))
 def test_whatever_is_given_is_taken_as_its_type_or_refused_in_one_line_that_names_all_of_it(values):
     bad = [name for name in OTHERS if name in values and not WANTED[name](values[name])]

@@ -73,6 +73,7 @@ def test_observations_stay_in_their_space_at_full_speed_to_the_end(make, name, d
     assert env.observation_space.shape == (16, 8)
 
 
+@pytest.mark.slow
 def test_equal_seeds_give_equal_episodes_and_others_do_not(make):
     env = make(IDS[0])
     seen = []

@@ -199,6 +199,7 @@ def test_the_global_random_numbers_of_torch_play_no_part(make_env):
     assert_equal(rollouts[0], rollouts[1])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize("command", COMMANDS)
 @parametrized

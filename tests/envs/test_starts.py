@@ -35,6 +35,7 @@ def move(simulation, steps=10, seed=0):
         simulation.step(action)
 
 
+@pytest.mark.slow
 def test_starts_are_uniform_around_home_and_at_rest(simulate, any_env):
     simulation = simulate(name=any_env.name, robots=500)
     starts = []

@@ -56,6 +56,7 @@ def test_a_command_limit_is_needed_for_each_joint(values):
         spec_of(command_limit=values)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("override", "words"),
     [

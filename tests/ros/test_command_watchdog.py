@@ -102,6 +102,7 @@ def test_who_commands_the_watchdog_may_stand_by_to_command_the_controller(watchd
     assert watchdog.call("/command_watchdog/reset").success
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 def test_its_heart_beats_as_often_as_it_looks_and_not_while_it_stands_still(watchdog):
     beats = []
@@ -118,6 +119,7 @@ def test_its_heart_beats_as_often_as_it_looks_and_not_while_it_stands_still(watc
     wait_for(lambda: len(beats) > count + 5)
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 def test_what_waited_while_the_watchdog_stood_still_is_not_passed_on(watchdog):
     for _ in range(3):
@@ -135,6 +137,7 @@ def test_what_waited_while_the_watchdog_stood_still_is_not_passed_on(watchdog):
         assert next(at for at, moves in after if not moves) - max([since, *moving]) < 0.05
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 def test_a_command_that_has_waited_counts_from_when_it_came():
     with free_domain() as domain:

@@ -79,6 +79,7 @@ def test_a_false_that_follows_at_once_does_not_undo_it(loop, profile):
         loop.peer.wait_state("estop")
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 @pytest.mark.parametrize("profile", PROFILES.values(), ids=PROFILES)
 def test_a_message_of_every_quality_of_service_stops_the_arm_at_once(loop, profile):
@@ -105,6 +106,7 @@ def test_only_a_reset_ends_it_and_the_goal_is_forgotten(loop):
     loop.peer.moved(after=since)
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 def test_false_neither_stops_the_arm_nor_ends_a_stop(loop):
     since = loop.start()

@@ -72,6 +72,7 @@ def test_where_nothing_can_be_written_it_says_so(monkeypatch, tmp_path):
     assert closed(EmergencyStopFile(NODE, 7)).unusable == f"{tmp_path / 'file' / 'physai'}: Not a directory"
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 def test_a_disk_that_refuses_is_told_of_and_asked_again(home):
     file = EmergencyStopFile(NODE, 7)

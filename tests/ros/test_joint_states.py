@@ -137,6 +137,7 @@ def test_the_arm_stops_counts_and_goes_on_by_itself(loop, name):
     assert loop.peer.wait_state("active")
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 @pytest.mark.parametrize(
     "change", [BAD["velocity missing"], BAD["velocity NaN"]], ids=["missing velocities", "NaN velocities"]
@@ -180,6 +181,7 @@ def test_of_a_joint_that_counts_from_minus_pi_to_pi_lead_around_the_corner(polic
         assert "holds: position jump" not in str(loop.diagnosis())
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 def test_that_jump_stop_the_arm_until_they_agree(loop):
     loop.start()
@@ -335,6 +337,7 @@ def test_that_come_again_after_half_a_second_move_the_arm_on(loop):
     loop.peer.moved(after=time.monotonic())
 
 
+@pytest.mark.slow
 def test_by_another_publisher_than_before_need_a_new_goal_however_soon_they_come(loop):
     loop.start()
     position = loop.arm.position

@@ -72,6 +72,7 @@ def test_an_end_while_the_arm_moves_leaves_it_where_it_is(listener, run, positio
     assert moved  # it had moved
 
 
+@pytest.mark.slow
 def test_a_watchdog_repeats_the_last_positions_and_makes_none_up(listener, run):
     run("command_watchdog", command="joint_position", joints=2, timeout=0.1)
     time.sleep(1.0)

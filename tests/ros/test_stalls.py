@@ -10,6 +10,7 @@ import pytest
 from tests.ros.stalls import Stalls
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 @pytest.mark.skipif(sys.platform != "linux", reason="cores are watched on Linux")
 def test_a_core_that_stands_still_is_noticed_and_is_over_afterwards():

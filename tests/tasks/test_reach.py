@@ -246,6 +246,7 @@ def rows_of_two(low, high):
     return st.lists(st.tuples(*[st.floats(low, high, width=32)] * 2), min_size=4, max_size=4)
 
 
+@pytest.mark.slow
 @given(rows_of_two(-100, 100), rows_of_two(-3, 3), rows_of_two(-1, 1))
 def test_what_a_simulation_observes_is_what_a_policy_sees(both, joint_position, joint_velocity, goal):
     for simulation in both:

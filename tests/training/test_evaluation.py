@@ -50,6 +50,7 @@ def test_evaluation_moves_neither_statistics_nor_random_numbers_nor_the_training
         assert all(torch.equal(value, state["env"][part][key]) for key, value in after["env"][part].items())
 
 
+@pytest.mark.slow
 def test_equal_seeds_give_equal_goals_and_results_whatever_happened_before(trained):
     agent, env = trained
     first = evaluate(agent.actor, env, 20, seed=5)

@@ -146,6 +146,7 @@ def evaluating(tmp_path):
         one.close()
 
 
+@pytest.mark.slow
 def test_robots_for_evaluation_are_made_when_first_needed_and_that_moves_no_random_number(evaluating):
     trainer, evaluation = evaluating()
     assert evaluation._env is None
@@ -157,6 +158,7 @@ def test_robots_for_evaluation_are_made_when_first_needed_and_that_moves_no_rand
     assert {"evaluation/success_rate", "evaluation/return", "evaluation/final_distance"} <= set(values[0])
 
 
+@pytest.mark.slow
 def test_more_goals_than_robots_are_evaluated_in_rounds(evaluating, monkeypatch):
     monkeypatch.setattr(callbacks, "MAX_ROBOTS", 8)
     trainer, evaluation = evaluating("evaluation.goals=20")
@@ -164,6 +166,7 @@ def test_more_goals_than_robots_are_evaluated_in_rounds(evaluating, monkeypatch)
     assert evaluation._env.simulation.num_envs == 8
 
 
+@pytest.mark.slow
 def test_after_a_resume_a_policy_worse_than_the_best_before_does_not_take_its_place(evaluating):
     trainer, evaluation = evaluating()
     batch = torch.zeros(16, 64)
@@ -175,6 +178,7 @@ def test_after_a_resume_a_policy_worse_than_the_best_before_does_not_take_its_pl
     assert evaluation.state() == {"best": [1.0, 1000.0], "best_frames": 7}
 
 
+@pytest.mark.slow
 def test_each_evaluation_normalizes_with_the_statistics_of_its_moment(evaluating):
     trainer, evaluation = evaluating("evaluation.goals=2")
     statistics = trainer.agent.statistics
@@ -193,6 +197,7 @@ def test_resuming_a_complete_run_shows_its_result(small_run, capsys):
     assert digest(run) == before
 
 
+@pytest.mark.slow
 def test_a_loss_that_explodes_stops_the_run_and_keeps_the_evidence(tmp_path):
     config = small_config("algo.optimizer.lr=1e30", "algo.scheduler=null")
     with pytest.raises(UserError, match=r"iteration \d+: .* is not finite") as stopped:

@@ -82,6 +82,7 @@ def test_the_observation_is_made_of_what_is_measured(make_env, name):
         assert (tip - true_tip).norm(dim=-1).mean() > 0.01
 
 
+@pytest.mark.slow
 def test_reward_and_success_are_those_of_the_true_state(make_env):
     env = make_env(OFFSET, POSITION, VELOCITY, robots=256)
     simulation, tolerance = env.simulation, env.simulation.task.tolerances[0].value
