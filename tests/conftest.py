@@ -43,8 +43,8 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     for item in items:
-        if not {"position_run", "recurrent_run"}.isdisjoint(getattr(item, "fixturenames", ())):
-            item.add_marker(pytest.mark.slow)  # a policy of their own is trained for them
+        if not {"position_run", "recurrent_run", "small_run"}.isdisjoint(getattr(item, "fixturenames", ())):
+            item.add_marker(pytest.mark.slow)  # a run of their own is made for them
     if (chosen := config.getoption("--realtime")) is None:
         return
     wanted = [item for item in items if (item.get_closest_marker("realtime") is not None) == (chosen == "only")]
