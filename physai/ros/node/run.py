@@ -114,6 +114,8 @@ def _run(make_node: Callable[[], StoppableNode], caught: Mapping[int, object]) -
     except Exception:  # said here: nothing can be said any more when this function has returned
         traceback.print_exc()
         return 1
+    gc.collect()
+    gc.freeze()  # to look for garbage in all that is imported would hold up every command for a tenth of a second
     executor = SingleThreadedExecutor()
     executor.add_node(node)
     code, last_words = 0, ""
