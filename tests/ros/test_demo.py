@@ -24,6 +24,7 @@ def alive(pid: int) -> bool:
     return status.exists() and "\nState:\tZ" not in status.read_text()
 
 
+@pytest.mark.realtime  # at 1 rad/s, a busy computer makes the arm pass its goal
 @pytest.mark.slow
 def test_goals_are_reached_and_held_for_three_seconds_and_the_path_is_drawn(start, policy_path, tmp_path):
     picture = tmp_path / "path.png"
@@ -35,6 +36,7 @@ def test_goals_are_reached_and_held_for_three_seconds_and_the_path_is_drawn(star
     assert image.std() > 10
 
 
+@pytest.mark.realtime  # at 1 rad/s, a busy computer makes the arm pass its goal
 @pytest.mark.slow
 def test_a_policy_that_commands_positions_drives_an_arm_that_takes_them(start, position_run, tmp_path):
     picture = tmp_path / "path.png"
