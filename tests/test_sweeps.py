@@ -7,21 +7,8 @@ import time
 
 import pytest
 
-from tests.training.small import command
+from tests.training.small import TINY, command
 
-# Runs of two iterations, episodes of 20 steps: what is tested is what starts them.
-TINY = (
-    "total_frames=1024",
-    "checkpoint.every_frames=512",
-    "evaluation.every_frames=512",
-    "evaluation.goals=8",
-    "evaluation.episodes=8",
-    "env.task.max_steps=20",
-    "collector.num_envs=16",
-    "collector.frames_per_batch=512",
-    "algo.minibatch_size=128",
-    "export=[]",
-)
 SWEEP = ("-m", *TINY, "hydra.sweep.dir=sweep")
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]  # a busy machine is no fault of a test

@@ -15,24 +15,9 @@ from physai.search import __main__ as search
 from physai.search.space import make_space
 from physai.search.study import Study
 from physai.search.trials import time_to_target
-from tests.training.small import command
+from tests.training.small import TINY, command
 
-# Runs of two iterations, episodes of 20 steps: what is tested is what starts them.
-TINY = (
-    "total_frames=1024",
-    "checkpoint.every_frames=512",
-    "evaluation.every_frames=512",
-    "evaluation.goals=8",
-    "evaluation.episodes=8",
-    "env.task.max_steps=20",
-    "collector=single",
-    "collector.num_envs=16",
-    "collector.frames_per_batch=512",
-    "algo.minibatch_size=128",
-    "algo.epochs=1",
-    "~search@search.ranges",
-    "hydra.run.dir=search",
-)
+OVERRIDES = (*TINY, "collector=single", "algo.epochs=1", "~search@search.ranges", "hydra.run.dir=search")
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]  # a busy machine is no fault of a test
 
@@ -43,7 +28,7 @@ def run(tmp_path, monkeypatch, capfd):
 
     def run(*arguments):
         monkeypatch.chdir(tmp_path)
-        monkeypatch.setattr(sys, "argv", ["physai.search", *TINY, *arguments])
+        monkeypatch.setattr(sys, "argv", ["physai.search", *OVERRIDES, *arguments])
         monkeypatch.setenv("COLUMNS", "200")
         GlobalHydra.instance().clear()
         try:
@@ -126,7 +111,7 @@ def test_a_killed_search_goes_on_redoes_nothing_and_tries_what_it_would_have_tri
     ranges = {"algo.optimizer.lr": "interval(1e-3,1e-2)"}
     arguments = (*(f"{key}={text}" for key, text in ranges.items()), "search.trials=4", "search.jobs=2")
     folder = tmp_path / "search"
-    process = command("search", *TINY, *arguments, cwd=tmp_path, start_new_session=True)
+    process = command("search", *OVERRIDES, *arguments, cwd=tmp_path, start_new_session=True)
     wait_until(lambda: summaries(folder) and len(list(folder.glob("[123]/metrics.csv"))), process)
     os.killpg(process.pid, signal.SIGKILL)
     process.wait()

@@ -29,6 +29,20 @@ SMALL = (
     "algo.minibatch_size=256",
     "export=[]",  # which takes three times as long as all the rest
 )
+
+# Runs of two iterations, episodes of 20 steps: for tests of what starts them.
+TINY = (
+    "total_frames=1024",
+    "checkpoint.every_frames=512",
+    "evaluation.every_frames=512",
+    "evaluation.goals=8",
+    "evaluation.episodes=8",
+    "env.task.max_steps=20",
+    "collector.num_envs=16",
+    "collector.frames_per_batch=512",
+    "algo.minibatch_size=128",
+    "export=[]",
+)
 EXPORTED = "export=[torchscript,onnx]"  # as by default
 
 
