@@ -39,6 +39,9 @@ class VirtualRobotConfig(FaultConfig):
     command_timeout: float = parameter(0.0, "a command is over after this; 0: it holds for ever", "s", 0.0, 60.0)
 
 
+_LONGEST_PAUSE = 1.0  # s that the arm makes up for; in a longer one, such as a computer's sleep, it slept, too
+
+
 class VirtualRobot(StoppableNode):
     """Publishes /joint_states, and obeys the commands of its robot's controller as the real one does.
 
@@ -66,7 +69,8 @@ class VirtualRobot(StoppableNode):
         commands = controller_topic(self._arm.spec.command)
         self.create_subscription(Float64MultiArray, commands, self._take_command, qos.COMMAND)
         self.create_service(Trigger, "~/reset", self._reset)
-        self.create_timer(1.0 / config.rate_hz, self._step, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self._period, self._at = 1.0 / config.rate_hz, time.monotonic()  # of a step, and when the last one ended
+        self.create_timer(self._period, self._step, clock=Clock(clock_type=ClockType.STEADY_TIME))
         self.get_logger().info(f"'{self._arm.spec.name}' takes {self._arm.spec.command.value} of {list(joints)}")
 
     def _configure(self, config: VirtualRobotConfig) -> None:
@@ -89,7 +93,11 @@ class VirtualRobot(StoppableNode):
 
     def _step(self) -> None:
         now = time.monotonic()
-        position, velocity = self._arm.step(self._controller.value(now)[self._order])
+        self._at = max(self._at, now - _LONGEST_PAUSE)
+        # An arm does not slow down with the computer that plays it.
+        for _ in range(max(1, round((now - self._at) / self._period))):
+            self._at += self._period
+            position, velocity = self._arm.step(self._controller.value(self._at)[self._order])
         positions, velocities = [0.0] * len(self._names), [0.0] * len(self._names)
         for place, joint in self._shown:
             positions[place], velocities[place] = float(position[joint]), float(velocity[joint])

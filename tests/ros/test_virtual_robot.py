@@ -1,6 +1,7 @@
 """The virtual robot: the real controller's manners, and each of its faults."""
 
 import math
+import signal
 import time
 from array import array
 
@@ -49,6 +50,10 @@ class Robot:
         self.peer.close()
 
 
+def seconds(message) -> float:
+    return message.header.stamp.sec + message.header.stamp.nanosec * 1e-9
+
+
 @pytest.fixture(scope="module")
 def shared():
     with free_domain() as domain:
@@ -79,6 +84,19 @@ def other(domain):
     yield other
     for robot in made:
         robot.close()
+
+
+def test_its_arm_goes_on_while_its_computer_has_no_time_for_it(robot):
+    robot.command(0.5, 0.0)
+    robot.settles_at(0.5, 0.0)
+    robot.process.signal(signal.SIGSTOP)
+    time.sleep(0.4)
+    before = robot.state(after=0.0)
+    robot.process.signal(signal.SIGCONT)
+    after = robot.state()
+    passed = seconds(after) - seconds(before)
+    assert passed > 0.3
+    assert (after.position[0] - before.position[0]) / passed == pytest.approx(0.5, rel=0.1)
 
 
 def test_it_holds_the_last_velocity_and_drops_what_is_not_finite(robot):

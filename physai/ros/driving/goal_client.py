@@ -7,6 +7,7 @@ from types import TracebackType
 
 import numpy as np
 import rclpy
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.signals import SignalHandlerOptions
@@ -101,6 +102,7 @@ class GoalClient:
         self._policy = policy
         self._metadata = policy.metadata
         self._state = ""
+        self._stopped = ""
         prepare_middleware()
         self._context = Context()
         rclpy.init(context=self._context, signal_handler_options=SignalHandlerOptions.NO)
@@ -110,6 +112,7 @@ class GoalClient:
         self._goals = self._node.create_publisher(goals.goal_type(policy.metadata.goal), "/inference_node/goal", 1)
         self._node.create_subscription(JointState, "/joint_states", self._take_joint_state, qos.SENSOR)
         self._node.create_subscription(String, "/inference_node/state", self._take_state, qos.LATCHED)
+        self._node.create_subscription(DiagnosticArray, "/diagnostics", self._take_diagnostics, 10)
 
     def check_alone(self) -> None:
         """See that there is no other robot whose controller would obey.
@@ -142,7 +145,11 @@ class GoalClient:
             raise UserError(f"the nodes do not work: joint states: {bool(self.record.times)}, state: '{self._state}'")
 
     def send(self, goal: np.ndarray, hold: float) -> GoalResult:
-        """Send a goal [g], wait until it is reached, and watch the robot for a while, s."""
+        """Send a goal [g], wait until it is reached, and watch the robot for a while, s.
+
+        Raises:
+            UserError: If the node stops the robot for good, or one of the processes has ended.
+        """
         signal = self._metadata.goal
         result = GoalResult(goal, signal.unit, self._metadata.tolerances, time.monotonic())
         self.record.results.append(result)
@@ -165,6 +172,8 @@ class GoalClient:
             self._executor.spin_once(0.05)
             if done():
                 return True
+            if self._stopped:
+                raise UserError(f"the inference node has stopped the robot: {self._stopped}")
             for process in self.watch:
                 if process.ended:
                     raise UserError(f"{process.module} has ended: {process.last_words()}")
@@ -177,6 +186,9 @@ class GoalClient:
 
     def _take_state(self, message: String) -> None:
         self._state = message.data
+
+    def _take_diagnostics(self, message: DiagnosticArray) -> None:
+        self._stopped = next((s.message for s in message.status if s.level == DiagnosticStatus.ERROR), "")
 
     def __enter__(self) -> "GoalClient":
         return self
