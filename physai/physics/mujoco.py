@@ -7,7 +7,7 @@ import numpy as np
 
 from physai.config import Count, PositiveFloat
 from physai.errors import UserError
-from physai.physics.impulse import FASTEST, LIMIT_ERP, motor_velocity
+from physai.physics.impulse import FASTEST, limit_velocity, motor_velocity
 from physai.physics.interface import DynamicsParameters, RobotState, nominal_dynamics
 from physai.robots import RobotSpec, urdf
 from physai.signals import Quantity
@@ -15,12 +15,10 @@ from physai.signals import Quantity
 try:
     import mujoco
     from mujoco.batch import Batch
-except ModuleNotFoundError:
+except ModuleNotFoundError:  # whoever names this module says what installs it
     raise
-except ImportError as error:  # mujoco is three packages, which must be of one version
-    reason = " ".join(str(error).split()).partition(" Please")[0].partition(" Repair")[0]
-    again = "pip install --force-reinstall 'physai[mujoco]' mujoco-core mujoco-studio"
-    raise UserError(f"mujoco cannot be imported: {reason.rstrip('.')}: {again}") from error
+except ImportError as error:  # it is three packages, which must be of one version
+    raise UserError(" ".join(str(error).split())) from error
 
 _STEPS_PER_TIME_CONSTANT = 7  # of a servo: with fewer, a joint at its effort limit chatters
 
@@ -170,9 +168,7 @@ class _Impulse:
             self._batch.forward()
             free = np.clip(velocity + dt * self._acceleration, -FASTEST, FASTEST)
             target = free + self._gain * (command - free)
-            back = LIMIT_ERP / dt
-            low = np.where(position <= self._lower, back * (self._lower - position), -np.inf)
-            high = np.where(position >= self._upper, back * (self._upper - position), np.inf)
+            low, high = limit_velocity(self._lower - position, dt), -limit_velocity(position - self._upper, dt)
             velocity = motor_velocity(self._mass[:, self._places], free, target, effort, low, high)
             velocity = np.clip(velocity, -FASTEST, FASTEST)
             position += dt * velocity
