@@ -12,14 +12,12 @@ from tests.physics.moving import (
     DT,
     commands,
     dynamics,
-    joints,
     one_of,
     reset_all,
     resting,
     run,
     start,
     weak,
-    wild,
 )
 
 
