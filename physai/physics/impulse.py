@@ -96,8 +96,8 @@ def _solve(
 
 
 def _on(values: np.ndarray, step: np.ndarray) -> np.ndarray:
-    """Values [3, N, n] of the even steps, at the step that each joint is on."""
-    return np.take_along_axis(values, np.clip(step // 2 + 1, 0, 2)[None], axis=0)[0]
+    """Values [3, N, n] of the even steps -2, 0 and 2, at the one that each joint is on."""
+    return np.choose(step // 2 + 1, values, mode="clip")
 
 
 def _product(matrix: np.ndarray, vector: np.ndarray) -> np.ndarray:

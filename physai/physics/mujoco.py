@@ -75,6 +75,7 @@ class MuJoCoPhysics:
         self._unit_inertia = model.body_inertia[self._links] / model.body_mass[self._links, None]
         self._tip = spec.moving_links.index(spec.end_effector)
         self._mass, self._inertia = self._batch.expand("body_mass"), self._batch.expand("body_inertia")
+        self._damping = self._batch.expand("dof_damping")
         self._motor: _Impulse | _Servo = (
             _Impulse(spec, self._batch, substeps)
             if motor == "impulse"
@@ -95,6 +96,7 @@ class MuJoCoPhysics:
         mass[:, self._tip] += self._parameters["payload"][rows, 0]
         self._mass[rows[:, None], self._links] = mass
         self._inertia[rows[:, None], self._links] = mass[:, :, None] * self._unit_inertia
+        self._damping[rows] = self._parameters["joint_damping"][rows]
         self._batch.set_const(np.unique(rows))  # what MuJoCo derives from masses
         self._motor.set(rows, {key: value[rows] for key, value in self._parameters.items()})
 
@@ -114,8 +116,9 @@ class MuJoCoPhysics:
         return RobotState(self._position.copy(), self._velocity.copy())
 
     def parameters(self) -> DynamicsParameters:
-        """Masses as MuJoCo holds them; the rest as the motors got it."""
+        """Masses and damping as MuJoCo holds them; the rest as the motors got it."""
         parameters = {key: value.copy() for key, value in self._parameters.items()}
+        parameters["joint_damping"] = self._damping.copy()
         parameters["link_mass"] = self._mass[:, self._links]
         parameters["link_mass"][:, self._tip] -= parameters["payload"][:, 0]
         return parameters
@@ -141,7 +144,6 @@ class _Impulse:
         self._batch, self._substeps = batch, substeps
         self._lower, self._upper = spec.position_limit.T
         self._position, self._velocity = batch.bind("qpos"), batch.bind("qvel")
-        self._damping = batch.expand("dof_damping")
         self._acceleration, self._mass = batch.bind("qacc_smooth"), batch.bind("M")
         model = batch.model
         self._places = np.zeros((model.nv, model.nv), int)  # MuJoCo holds the lower triangle of the mass matrix
@@ -158,7 +160,6 @@ class _Impulse:
         self._speeding[rows], self._braking[rows] = dt * np.maximum(limit - friction, 0.0), dt * (limit + friction)
         gain = np.minimum(parameters["velocity_gain"], 1.0)
         self._gain[rows] = gain / (gain + self._substeps * (1.0 - gain))  # the time constant stays the same
-        self._damping[rows] = parameters["joint_damping"]
 
     def step(self, command: np.ndarray) -> None:
         dt = self._batch.model.opt.timestep
@@ -180,15 +181,14 @@ class _Servo:
 
     def __init__(self, batch: Batch, substeps: int, control_dt: float, time_constant: float) -> None:
         self._batch, self._substeps, self._dt, self._fastest = batch, substeps, control_dt, time_constant
-        self._damping, self._friction = batch.expand("dof_damping"), batch.expand("dof_frictionloss")
-        self._effort = batch.expand("actuator_forcerange")
+        self._friction, self._effort = batch.expand("dof_frictionloss"), batch.expand("actuator_forcerange")
         self._gain, self._bias = batch.expand("actuator_gainprm"), batch.expand("actuator_biasprm")
         self._mass = batch.bind("M")
         self._own = batch.model.M_rowadr + batch.model.M_rownnz - 1  # the diagonal of the mass matrix
         self._time_constant = np.zeros(batch.bind("qpos").shape)
 
     def set(self, rows: np.ndarray, parameters: DynamicsParameters) -> None:
-        self._damping[rows], self._friction[rows] = parameters["joint_damping"], parameters["joint_friction"]
+        self._friction[rows] = parameters["joint_friction"]
         self._effort[rows, :, 0], self._effort[rows, :, 1] = -parameters["effort_limit"], parameters["effort_limit"]
         gain = np.clip(parameters["velocity_gain"], 1e-6, 1.0)
         self._time_constant[rows] = self._fastest + self._dt * (1.0 - gain) / gain
