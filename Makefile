@@ -17,22 +17,22 @@ $(BIN)/python:
 
 $(VENV)/.installed: pyproject.toml constraints.txt | $(BIN)/python
 	@echo "==> Installing physai into $(VENV)"
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[onnx]'
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[mujoco,onnx]'
 	@touch $@
 
 $(VENV)/.installed-ros: $(VENV)/.installed
 	@echo "==> Installing ROS 2 Jazzy into $(VENV)"
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[onnx,ros]'
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[mujoco,onnx,ros]'
 	@touch $@
 
 $(VENV)/.installed-docs: $(VENV)/.installed
 	@echo "==> Installing the tools for the documentation into $(VENV)"
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[docs,onnx,ros]'
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[docs,mujoco,onnx,ros]'
 	@touch $@
 
 $(VENV)/.installed-dev: $(VENV)/.installed
 	@echo "==> Installing the tools for tests and benchmarks into $(VENV)"
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev,bench,docs,joblib,mlflow,onnx,optuna,ray,ray-launcher,ros,submitit,wandb]'
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev,bench,docs,joblib,mlflow,mujoco,onnx,optuna,ray,ray-launcher,ros,submitit,wandb]'
 	@touch $@
 
 train: $(VENV)/.installed  ## Train the two-link arm (ARGS="env=kuka_reacher seed=1" for more)

@@ -8,9 +8,11 @@ from omegaconf import DictConfig
 
 from physai import cli
 from physai.config import Config, Count, PackageName, Seed, validate
+from physai.errors import UserError
 from physai.files import write_atomically
 
 if TYPE_CHECKING:
+    from physai.envs.simulation import EnvConfig
     from physai.training.run import TrainedPolicy
 
 
@@ -21,20 +23,33 @@ class PolicyChoice(Config):
     allow: list[PackageName]
     checkpoint: str | int
     env: dict[str, Any] | None
+    physics: dict[str, Any] | None
     randomization: dict[str, Any] | None
 
     def load(self) -> "TrainedPolicy":
         """Read it; raises a UserError if something is missing or damaged."""
-        from physai.envs.simulation import EnvConfig
         from physai.physics import RandomizationConfig
         from physai.training.run import TrainedPolicy, load_config
 
         run_config = load_config(Path(self.run), self.allow)
-        env = None if self.env is None else validate(EnvConfig, DictConfig(self.env))
+        env = self._env(run_config.env)
         randomization = None
         if self.randomization is not None:
             randomization = validate(RandomizationConfig, DictConfig(self.randomization))
         return TrainedPolicy(Path(self.run), str(self.checkpoint), randomization, env, run_config)
+
+    def _env(self, run: "EnvConfig") -> "EnvConfig | None":
+        """The robots, where they are not just the run's: in its engine, unless another is chosen or comes along."""
+        from physai.envs.simulation import EnvConfig
+
+        if self.env is None and self.physics is None:
+            return None
+        node = dict(self.env or run.model_dump() | {"physics": self.physics})
+        if self.physics is not None and node.get("physics") != self.physics:
+            raise UserError(f"physics: the robots of '{node.get('name')}' come with their own")
+        if "physics" in node and node["physics"] is None:
+            node["physics"] = run.physics
+        return validate(EnvConfig, DictConfig(node))
 
 
 class EvaluateConfig(PolicyChoice):
@@ -56,12 +71,15 @@ def _evaluate(node: DictConfig, _: Path) -> None:
     seed = FINAL_SEED if config.seed is None else config.seed
     summary = policy.evaluate(config.episodes, seed).summary() | {
         "env": policy.config.env.name,
+        "physics": policy.config.env.physics,
         "randomization": policy.randomization.name,
         "checkpoint": config.checkpoint,
         "episodes": config.episodes,
         "seed": seed,
     }
-    names = [policy.randomization.name] if config.env is None else [policy.config.env.name, policy.randomization.name]
+    engine = policy.config.env.physics["_target_"].split(".")[-2]  # its module
+    chosen = {policy.config.env.name: config.env, engine: config.physics}
+    names = [*(name for name, choice in chosen.items() if choice is not None), policy.randomization.name]
     output = Path(config.run) / f"evaluation_{'_'.join(names)}.json"
     write_atomically(output, json.dumps(summary, indent=2).encode())
     print_summary(summary, f"{config.run}: {config.checkpoint}, on {config.episodes:,} goals")

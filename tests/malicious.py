@@ -167,15 +167,16 @@ EVALUATE: dict[str, Edit] = {
     "a Gymnasium env by its module": task("gymnasium.make", id="evil:Env-v0"),
     "a TorchRL env by its module": task("torchrl.envs.GymEnv", env_name="evil:Env-v0"),
     "an env of ours with overrides": task(
-        "physai.envs.gym_env.RobotGymEnv", env="reacher", overrides=["env.physics._target_=evil.Thing"]
+        "physai.envs.gym_env.RobotGymEnv", env="reacher", overrides=["physics._target_=evil.Thing"]
     ),
     "configs of ours from a package": task(
         "physai.compose.compose", name="train", overrides=["hydra.searchpath=[pkg://evil]"]
     ),
-    "a part that drives a robot": at("env.physics._target_", "physai.ros.RosPhysics"),
+    "a part that drives a robot": at("physics._target_", "physai.ros.RosPhysics"),
     # Its own module
     "a module beside the run": task("evil.Thing"),
-    "physics": at("env.physics", _THING),
+    "physics": at("physics", _THING),
+    "an env's physics": at("env.physics", _THING),
     "a loss": at("algo.loss", {**_THING, "_partial_": True}),
     "a logger": at("logger", _THING),
     "a part of a part": at("algo.buffer.sampler", _THING),

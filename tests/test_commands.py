@@ -13,6 +13,7 @@ from hydra.core.global_hydra import GlobalHydra
 from hydra.experimental.callback import Callback
 from omegaconf import OmegaConf
 
+from physai.compose import compose
 from tests.training.small import SMALL, command
 
 ROOT = Path(__file__).parent.parent
@@ -110,7 +111,7 @@ BAD_TRAINING = {
     "reversed range": (["randomization.payload.low=3"], "randomization.payload"),
     "a robot behind ROS": (["env=ros_reacher"], "a policy is trained on simulated robots; this one it can drive with"),
     "unknown physics": (
-        ["env.physics._target_=physai.physics.pybullet.PyBulletPhysic"],
+        ["physics._target_=physai.physics.pybullet.PyBulletPhysic"],
         "physics._target_: physai.physics.pybullet has no 'PyBulletPhysic'; did you mean 'PyBulletPhysics'?",
     ),
     "missing URDF": (["env.robot.urdf=/nowhere.urdf"], "/nowhere.urdf: no such URDF file"),
@@ -263,6 +264,27 @@ def test_evaluate_drives_another_env_and_names_its_file_after_it(run, copied):
     assert (result["env"], result["randomization"], result["episodes"]) == ("reacher", "default", 20)
 
 
+@pytest.mark.parametrize("env", [[], ["env=reacher"]], ids=["the run's env", "an env"])
+def test_evaluate_judges_a_policy_in_another_engine_and_names_its_file_after_it(run, copied, env):
+    code, _, error = run("evaluate", "run=run", "episodes=100", "physics=mujoco", "physics.motor=servo", *env)
+    assert code == 0, error
+    name = "_".join(["evaluation", *("reacher" for _ in env), "mujoco", "default"])
+    result = json.loads((copied / f"{name}.json").read_text())
+    assert result["physics"]["motor"] == "servo"
+    assert result["episodes"] == 100
+
+
+def test_an_env_that_is_chosen_stays_in_the_run_s_engine(run, copied):
+    config = copied / ".hydra" / "config.yaml"
+    node = OmegaConf.load(config)
+    node.physics = compose("train", ["physics=mujoco"]).physics
+    OmegaConf.save(node, config)
+    code, _, error = run("evaluate", "run=run", "episodes=20", "env=reacher")
+    assert code == 0, error
+    result = json.loads((copied / "evaluation_reacher_default.json").read_text())
+    assert result["physics"]["_target_"] == "physai.physics.mujoco.MuJoCoPhysics"
+
+
 @pytest.mark.parametrize(
     ("module", "arguments", "message"),
     [
@@ -286,8 +308,14 @@ def test_evaluate_drives_another_env_and_names_its_file_after_it(run, copied):
         ),
         (
             "evaluate",
-            ["run=run", "env=reacher", "env.physics._target_=physai.ros.RosPhysics"],
+            ["run=run", "physics=pybullet", "physics._target_=physai.ros.RosPhysics"],
             "env.physics: RosPhysics.__init__() missing 4 required positional arguments: 'homing_speed'",
+        ),
+        ("evaluate", ["run=run", "physics=mujoc"], "physics/mujoc: no such config; did you mean 'mujoco'?"),
+        (
+            "evaluate",
+            ["run=run", "env=ros_reacher", "physics=mujoco"],
+            "the robots of 'ros_reacher' come with their own",
         ),
         ("evaluate", [], "run=... is required"),
         ("play", ["run=run", "output=arm.avi"], "must end in .mp4 or .gif"),

@@ -57,7 +57,7 @@ def test_what_cannot_be_used_is_named(name, message):
     assert "\n" not in str(error.value)
 
 
-KEYS = ["env.task", "env.physics", "algo", "algo.loss", "algo.buffer.sampler", "algo.optimizer", "policy.actor"]
+KEYS = ["env.task", "physics", "algo", "algo.loss", "algo.buffer.sampler", "algo.optimizer", "policy.actor"]
 
 
 @pytest.mark.slow

@@ -97,10 +97,13 @@ class guard:  # noqa: N801
     def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
         for number, handler in self._before.items():
             signal.signal(number, handler)
-        if isinstance(error, UserError | OSError) and os.environ.get("HYDRA_FULL_ERROR") == "1":
+        if isinstance(error, UserError | OSError | ImportError) and os.environ.get("HYDRA_FULL_ERROR") == "1":
             traceback.print_exception(error)
         if isinstance(error, UserError):
             print(f"error: {printable(str(error))}", file=sys.stderr)
+            sys.exit(2)
+        if isinstance(error, ImportError):  # of what is half installed; TorchRL imports a simulator where it finds one
+            print(f"error: {printable(' '.join(str(error).split()))}", file=sys.stderr)
             sys.exit(2)
         if isinstance(error, OSError):
             where = str(error.filename or "the disk")

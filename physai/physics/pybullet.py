@@ -63,7 +63,8 @@ class PyBulletPhysics:
         self._finalizer = weakref.finalize(self, _disconnect, self._worlds)
         try:
             with tempfile.TemporaryDirectory(prefix="physai-") as folder:
-                model = _model_for_physics(spec, Path(folder))
+                model = Path(folder) / "robot.urdf"
+                model.write_bytes(urdf.without_shapes(spec.urdf, spec.joints))
                 most = robots_per_world(spec)
                 for first in range(0, num_robots, most):
                     robots = min(most, num_robots - first)
@@ -202,20 +203,6 @@ class PyBulletPhysics:
 def _disconnect(worlds: list[_World]) -> None:
     while worlds:
         bullet.disconnect(worlds.pop().client)
-
-
-def _model_for_physics(spec: RobotSpec, folder: Path) -> Path:
-    """Write the URDF without shapes and with the uncontrolled joints welded at zero."""
-    tree = urdf.parse(spec.urdf)
-    for link in tree.iter("link"):
-        for shape in link.findall("visual") + link.findall("collision"):
-            link.remove(shape)
-    for joint in tree.iter("joint"):
-        if joint.get("name") not in spec.joints and joint.getparent().tag == "robot":
-            joint.set("type", "fixed")
-    path = folder / "robot.urdf"
-    tree.write(path, encoding="utf-8", xml_declaration=True)
-    return path
 
 
 def _make_world(spec: RobotSpec, model: Path, robots: int, time_step: float) -> _World:

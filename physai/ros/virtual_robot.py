@@ -1,4 +1,4 @@
-"""A PyBullet arm behind the topics of a ros2_control controller: a real robot's place, without its dangers."""
+"""A simulated arm behind the topics of a ros2_control controller: a real robot's place, without its dangers."""
 
 import sys
 import time
@@ -30,6 +30,7 @@ class VirtualRobotConfig(FaultConfig):
         (), "Hydra overrides of it, such as env.robot.command=joint_position", fixed=True
     )
     randomization: str = parameter("none", "a file of conf/randomization: its dynamics, delay and sensors", fixed=True)
+    physics: str = parameter("pybullet", "a file of conf/physics: the engine", fixed=True)
     seed: int = parameter(0, "draws one robot from the randomization", "", 0, 2**31 - 1, fixed=True)
     rate_hz: float = parameter(100.0, "joint states per second, and physics steps", "Hz", 1.0, 1000.0, fixed=True)
     joints: tuple[str, ...] = parameter((), "joints of the commands, in their order; empty: the robot's", fixed=True)
@@ -52,7 +53,9 @@ class VirtualRobot(StoppableNode):
     def __init__(self) -> None:
         super().__init__("virtual_robot")
         config = declare(self, VirtualRobotConfig, self._configure)
-        self._arm = VirtualArm(config.env, config.randomization, config.seed, 1.0 / config.rate_hz, config.overrides)
+        self._arm = VirtualArm(
+            config.env, config.randomization, config.seed, 1.0 / config.rate_hz, config.overrides, config.physics
+        )
         known = self._arm.spec.joints
         joints = config.joints or known
         if sorted(joints) != sorted(known):

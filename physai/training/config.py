@@ -44,6 +44,7 @@ class TrainConfig(Config):
     """Everything that decides the outcome of a run."""
 
     env: EnvConfig
+    physics: Target  # what an env refers to that brings none along
     algo: Target
     policy: PolicyConfig
     collector: CollectorConfig

@@ -1,4 +1,4 @@
-"""An engine of 49 lines (tests/physics/dummy.py) in PyBullet's place, with no change above it."""
+"""An engine of 49 lines (tests/physics/dummy.py), and MuJoCo, in PyBullet's place, with no change above them."""
 
 import gymnasium
 import numpy as np
@@ -70,14 +70,16 @@ def test_a_policy_is_evaluated_on_it(make, command):
     assert torch.equal(found.length, again.length)
 
 
-def test_gymnasium_s_checker_passes_on_it():
-    env = gymnasium.make("physai/Reacher-v0", overrides=[DUMMY])
+@pytest.mark.parametrize("engine", [[DUMMY], ["physics=mujoco"], ["physics=mujoco", "physics.motor=servo"]])
+def test_gymnasium_s_checker_passes_on_it(engine):
+    env = gymnasium.make("physai/Reacher-v0", overrides=engine)
     check_env(env.unwrapped, skip_render_check=True)
     env.close()
 
 
-def test_a_saved_state_goes_on_bit_for_bit_on_it(make):
-    env, restored = make(4, "randomization=strong"), make(4, "randomization=strong")
+@pytest.mark.parametrize("engine", [[], ["env.physics=${physics}", "physics=mujoco"]], ids=["dummy", "mujoco"])
+def test_a_saved_state_goes_on_bit_for_bit_on_it(make, engine):
+    env, restored = (make(4, "randomization=strong", *engine) for _ in range(2))
     td = env.reset()
     restored.set_state(env.state())
     for action in 2 * torch.rand(20, 4, 2, generator=torch.Generator().manual_seed(0)) - 1:
@@ -85,6 +87,29 @@ def test_a_saved_state_goes_on_bit_for_bit_on_it(make):
         other = restored.step(td.clone().set("action", action))["next"]
         assert torch.equal(td["joint_position"], other["joint_position"])
         assert torch.equal(td["reward"], other["reward"])
+
+
+@pytest.mark.parametrize("name", ["reacher", "kuka_reacher"])
+def test_an_engine_is_chosen_by_name_and_one_that_an_env_brings_along_stays(env_config, name):
+    assert env_config(name).physics["_target_"] == "physai.physics.pybullet.PyBulletPhysics"
+    chosen = env_config(name, "physics=mujoco", "physics.motor=servo").physics
+    assert chosen["_target_"] == "physai.physics.mujoco.MuJoCoPhysics"
+    assert chosen["motor"] == "servo"
+    assert env_config("ros_reacher", "physics=mujoco").physics["_target_"] == "physai.ros.RosPhysics"
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("physics.motor=serve", "physics.motor: input should be 'impulse' or 'servo', got 'serve'"),
+        ("physics.threads=0", "physics.threads: input should be greater than 0, got 0"),
+        ("physics.motor_time_constant=0", "physics.motor_time_constant: input should be greater than 0"),
+        ("+physics.thread=2", "unknown key 'thread' of physai.physics.mujoco.MuJoCoPhysics; did you mean"),
+    ],
+)
+def test_what_an_engine_does_not_take_is_one_line(env_config, override, message):
+    with pytest.raises(UserError, match=message.replace(".", r"\.")):
+        env_config("reacher", "physics=mujoco", override)
 
 
 def test_what_is_no_engine_is_refused_by_name(env_config):

@@ -1,10 +1,13 @@
 """Robots that engines are tried with."""
 
 from collections.abc import Callable, Iterator
+from functools import partial
 
 import pytest
 
 from physai.envs.simulation import EnvConfig
+from physai.physics import Physics
+from physai.physics.mujoco import MuJoCoPhysics
 from physai.physics.pybullet import PyBulletPhysics
 from physai.robots import RobotSpec
 from tests.physics.moving import DT
@@ -21,13 +24,26 @@ def planar(reacher: EnvConfig) -> RobotSpec:
     return RobotSpec.from_config(reacher.robot)
 
 
+ENGINES = {
+    "pybullet": PyBulletPhysics,
+    "impulse": partial(MuJoCoPhysics, motor="impulse", motor_time_constant=0.015, threads=1),
+    "servo": partial(MuJoCoPhysics, motor="servo", motor_time_constant=0.015, threads=1),
+}
+
+
+@pytest.fixture(params=ENGINES)
+def engine(request: pytest.FixtureRequest) -> Callable[..., Physics]:
+    """Each engine in turn, and with each of its motors."""
+    return ENGINES[request.param]
+
+
 @pytest.fixture
-def make() -> Iterator[Callable[..., PyBulletPhysics]]:
+def make(engine: Callable[..., Physics]) -> Iterator[Callable[..., Physics]]:
     """Make physics that is closed after the test."""
     made = []
 
-    def make_physics(spec: RobotSpec, robots: int, **options: int) -> PyBulletPhysics:
-        made.append(PyBulletPhysics(spec, robots, DT, **options))
+    def make_physics(spec: RobotSpec, robots: int, **options: int) -> Physics:
+        made.append(engine(spec, robots, DT, **options))
         return made[-1]
 
     yield make_physics

@@ -1,10 +1,12 @@
-"""What each dynamics parameter does to a robot, with PyBullet's motors."""
+"""What each dynamics parameter does to a robot, with PyBullet's motors, and with MuJoCo's that follow their law."""
 
 import numpy as np
 import pytest
 
 from physai.robots import RobotSpec
 from tests.physics.moving import DT, dynamics, reset_all, resting, run, start
+
+pytestmark = pytest.mark.parametrize("engine", ["pybullet", "impulse"], indirect=True)
 
 
 def speeds(physics, parameters, steps, qd=0.0, command=1.0):

@@ -12,6 +12,8 @@ from tests.physics.moving import DT, dynamics, joints, reset_all, resting, run, 
 
 TARGET = np.array([[0.8, -0.6], [-1.2, 0.9]])
 
+pytestmark = pytest.mark.parametrize("engine", ["pybullet", "impulse"], indirect=True)
+
 
 @pytest.fixture(scope="module")
 def spec(any_env):

@@ -169,8 +169,9 @@ def _import() -> None:
     """What nodes need; PyBullet prints a line, of which neither the tests nor each node shall hear."""
     stdout = os.dup(1)
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
-    for module in ("inference_node", "virtual_robot", "record", "command_watchdog"):
-        importlib.import_module(f"physai.ros.{module}")
+    nodes = (f"physai.ros.{node}" for node in ("inference_node", "virtual_robot", "record", "command_watchdog"))
+    for module in (*nodes, "physai.physics.pybullet"):  # a virtual robot's engine, which it imports by its name
+        importlib.import_module(module)
     ctypes.CDLL(None).fflush(None)
     os.dup2(stdout, 1)
 

@@ -126,7 +126,20 @@ def test_reset_brings_it_home():
         arm.close()
 
 
-@pytest.mark.parametrize(("env", "randomization"), [("nobody", "none"), ("reacher", "nothing")])
-def test_an_unknown_config_is_named(env, randomization):
-    with pytest.raises(UserError, match=r"nobody|nothing"):
-        VirtualArm(env, randomization, 0, 0.01)
+@pytest.mark.parametrize(("motor", "tolerance"), [("impulse", 2e-3), ("servo", 5e-3)])  # friction slows a servo down
+def test_an_arm_in_another_engine_moves_as_told(motor, tolerance):
+    arm = VirtualArm("ros_reacher", "none", 0, 0.01, [f"physics.motor={motor}"], "mujoco")
+    try:
+        steps = np.array([arm.step(np.array([0.5, -0.3]))[0] for _ in range(50)])
+        np.testing.assert_allclose(steps[-1] - steps[-11], [0.05, -0.03], rtol=0, atol=tolerance)
+    finally:
+        arm.close()
+
+
+@pytest.mark.parametrize(
+    ("env", "randomization", "physics"),
+    [("nobody", "none", "pybullet"), ("reacher", "nothing", "pybullet"), ("reacher", "none", "no_engine")],
+)
+def test_an_unknown_config_is_named(env, randomization, physics):
+    with pytest.raises(UserError, match=r"nobody|nothing|no_engine"):
+        VirtualArm(env, randomization, 0, 0.01, physics=physics)

@@ -10,11 +10,11 @@ from physai.compose import compose, conf_dir
 from physai.config import nearest, validate
 from physai.envs.simulation import EnvConfig
 from physai.errors import UserError
-from physai.physics import ActuatorDelay, ParameterLayout, RandomizationConfig, RobotState, SensorErrors
-from physai.physics.pybullet import PyBulletPhysics
+from physai.physics import ActuatorDelay, ParameterLayout, Physics, RandomizationConfig, RobotState, SensorErrors
 from physai.robots import RobotSpec
 from physai.seeding import derive
 from physai.signals import Quantity
+from physai.targets import make
 
 
 class GroupController:
@@ -56,7 +56,7 @@ class GroupController:
 
 
 class VirtualArm:
-    """One PyBullet arm as its sensors show it, with the dynamics, delay and sensor errors of a randomization config.
+    """One simulated arm as its sensors show it, with the dynamics, delay and sensor errors of a randomization config.
 
     Args:
         env: A file of ``conf/env``.
@@ -64,21 +64,32 @@ class VirtualArm:
         seed: Draws one robot from it.
         period: Time from step to step, s.
         overrides: Hydra overrides such as ``env.robot.command=joint_position``.
+        physics: A file of ``conf/physics``: its engine, also where the env brings one along.
 
     Raises:
         UserError: If there is no such config.
     """
 
-    def __init__(self, env: str, randomization: str, seed: int, period: float, overrides: Sequence[str] = ()) -> None:
-        for group, name in (("env", env), ("randomization", randomization)):
+    def __init__(
+        self,
+        env: str,
+        randomization: str,
+        seed: int,
+        period: float,
+        overrides: Sequence[str] = (),
+        physics: str = "pybullet",
+    ) -> None:
+        groups = {"env": env, "randomization": randomization, "physics": physics}
+        for group, name in groups.items():
             files = [path.stem for path in (conf_dir() / group).glob("*.yaml")]
             if name not in files:
                 raise UserError(f"{group}: no file '{name}' in conf/{group}{nearest(name, files)}")
-        node = compose("train", [f"env={env}", f"randomization={randomization}", *overrides])
+        node = compose("train", [*(f"{group}={name}" for group, name in groups.items()), *overrides])
+        node.env.physics = node.physics
         config = validate(EnvConfig, node.env)
         draws = validate(RandomizationConfig, node.randomization)
         self.spec = RobotSpec.from_config(config.robot)
-        self._physics = PyBulletPhysics(self.spec, 1, period)
+        self._physics: Physics = make("physics", config.physics, self.spec, 1, period, needs=("reset", "step", "close"))
         layout = ParameterLayout(self.spec)
         self._parameters = draws.sample(1, layout, torch.Generator().manual_seed(derive(seed, "virtual robot")))
         self._dynamics = layout.dynamics(self._parameters.numpy())

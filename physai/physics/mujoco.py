@@ -1,0 +1,222 @@
+"""MuJoCo as a batch of robots, with PyBullet's motors or with a drive's."""
+
+import math
+from typing import Literal
+
+import numpy as np
+
+from physai.config import Count, PositiveFloat
+from physai.errors import UserError
+from physai.physics.impulse import FASTEST, limit_velocity, motor_velocity
+from physai.physics.interface import DynamicsParameters, RobotState, nominal_dynamics
+from physai.robots import RobotSpec, urdf
+from physai.signals import Quantity
+
+try:
+    import mujoco
+    from mujoco.batch import Batch
+except ModuleNotFoundError:  # whoever names this module says what installs it
+    raise
+except ImportError as error:  # it is three packages, which must be of one version
+    raise UserError(" ".join(str(error).split())) from error
+
+_STEPS_PER_TIME_CONSTANT = 7  # of a servo: with fewer, a joint at its effort limit chatters
+
+
+class MuJoCoPhysics:
+    """N robots with a fixed base, in free space under gravity.
+
+    The interface is :class:`physai.physics.Physics`. Joints that the spec does not control are welded at zero, and
+    shapes are left out: nothing touches anything here, so the state of a robot is its joint positions and velocities.
+
+    A motor drives each joint at a velocity; where the robot takes positions, a servo tells the motor how fast to go,
+    once a control period.
+
+    - ``impulse`` is PyBullet's motor and integration (:mod:`physai.physics.impulse`), so robots move as in
+      :class:`physai.physics.pybullet.PyBulletPhysics`, friction included.
+    - ``servo`` is how a drive behaves: an effort in proportion to the missing velocity closes in on it with a time
+      constant, whatever the pose; dry friction resists; limits of joints are as soft as MuJoCo has them. It takes as
+      many steps a period as the time constant asks for.
+
+    Args:
+        spec: The robot.
+        num_robots: How many, N.
+        control_dt: Control period, s.
+        substeps: Physics steps per control period, at least.
+        motor: Which motor.
+        motor_time_constant: Of a servo with a velocity gain of 1, s.
+        threads: Among which the robots are divided; no result depends on it.
+
+    Raises:
+        UserError: If MuJoCo refuses the URDF.
+    """
+
+    simulated = True
+
+    def __init__(
+        self,
+        spec: RobotSpec,
+        num_robots: int,
+        control_dt: float,
+        substeps: int = 1,
+        *,
+        motor: Literal["impulse", "servo"],
+        motor_time_constant: PositiveFloat,
+        threads: Count,
+    ) -> None:
+        self.num_robots = num_robots
+        self._spec = spec
+        if motor == "servo":
+            substeps = max(substeps, math.ceil(_STEPS_PER_TIME_CONSTANT * control_dt / motor_time_constant))
+        model = _make_model(spec, motor, control_dt / substeps)
+        self._batch = Batch(model, num_robots, threads)
+        self._position, self._velocity = self._batch.bind("qpos"), self._batch.bind("qvel")
+        self._links = [model.body(name).id for name in spec.moving_links]
+        self._unit_inertia = model.body_inertia[self._links] / model.body_mass[self._links, None]
+        self._tip = spec.moving_links.index(spec.end_effector)
+        self._mass, self._inertia = self._batch.expand("body_mass"), self._batch.expand("body_inertia")
+        self._damping = self._batch.expand("dof_damping")
+        self._motor: _Impulse | _Servo = (
+            _Impulse(spec, self._batch, substeps)
+            if motor == "impulse"
+            else _Servo(self._batch, substeps, control_dt, motor_time_constant)
+        )
+        self._parameters = {key: np.repeat(value, num_robots, axis=0) for key, value in nominal_dynamics(spec).items()}
+        home = RobotState(np.tile(spec.home, (num_robots, 1)), np.zeros((num_robots, len(spec.joints))))
+        self.reset(np.arange(num_robots), home, self._parameters)
+
+    def reset(self, rows: np.ndarray, state: RobotState, parameters: DynamicsParameters | None = None) -> None:
+        """See :meth:`physai.physics.Physics.reset`."""
+        self._position[rows], self._velocity[rows] = state.joint_position, state.joint_velocity
+        if parameters is None or not len(rows):
+            return
+        for key, value in parameters.items():
+            self._parameters[key][rows] = value
+        mass = self._parameters["link_mass"][rows]
+        mass[:, self._tip] += self._parameters["payload"][rows, 0]
+        self._mass[rows[:, None], self._links] = mass
+        self._inertia[rows[:, None], self._links] = mass[:, :, None] * self._unit_inertia
+        self._damping[rows] = self._parameters["joint_damping"][rows]
+        self._batch.set_const(np.unique(rows))  # what MuJoCo derives from masses
+        self._motor.set(rows, {key: value[rows] for key, value in self._parameters.items()})
+
+    def step(self, command: np.ndarray) -> RobotState:
+        """See :meth:`physai.physics.Physics.step`."""
+        expected = self._position.shape
+        if command.shape != expected:
+            raise ValueError(f"commands of shape {expected} are needed, got {command.shape}")
+        if self._spec.command is Quantity.JOINT_POSITION:
+            fastest, to_go = self._spec.velocity_limit, command - self._position
+            command = np.clip(self._spec.position_gain * to_go, -fastest, fastest)
+        self._motor.step(command)
+        return self.robot_state()
+
+    def robot_state(self) -> RobotState:
+        """See :meth:`physai.physics.Physics.robot_state`."""
+        return RobotState(self._position.copy(), self._velocity.copy())
+
+    def parameters(self) -> DynamicsParameters:
+        """Masses and damping as MuJoCo holds them; the rest as the motors got it."""
+        parameters = {key: value.copy() for key, value in self._parameters.items()}
+        parameters["joint_damping"] = self._damping.copy()
+        parameters["link_mass"] = self._mass[:, self._links]
+        parameters["link_mass"][:, self._tip] -= parameters["payload"][:, 0]
+        return parameters
+
+    def state(self) -> dict[str, np.ndarray]:
+        """See :meth:`physai.physics.Physics.state`."""
+        parameters = {key: value.copy() for key, value in self._parameters.items()}
+        return {"joint_position": self._position.copy(), "joint_velocity": self._velocity.copy(), **parameters}
+
+    def set_state(self, state: dict[str, np.ndarray]) -> None:
+        """See :meth:`physai.physics.Physics.set_state`."""
+        robots = RobotState(state["joint_position"], state["joint_velocity"])
+        self.reset(np.arange(self.num_robots), robots, {key: state[key] for key in self._parameters})
+
+    def close(self) -> None:
+        """Do nothing: what MuJoCo holds goes with this object."""
+
+
+class _Impulse:
+    """PyBullet's motors, limits, damping and steps, on MuJoCo's mass matrix and forces."""
+
+    def __init__(self, spec: RobotSpec, batch: Batch, substeps: int) -> None:
+        self._batch, self._substeps = batch, substeps
+        self._lower, self._upper = spec.position_limit.T
+        self._position, self._velocity = batch.bind("qpos"), batch.bind("qvel")
+        self._acceleration, self._mass = batch.bind("qacc_smooth"), batch.bind("M")
+        model = batch.model
+        self._places = np.zeros((model.nv, model.nv), int)  # MuJoCo holds the lower triangle of the mass matrix
+        for row, (start, count) in enumerate(zip(model.M_rowadr, model.M_rownnz, strict=True)):
+            columns = model.M_colind[start : start + count]
+            self._places[row, columns] = self._places[columns, row] = np.arange(start, start + count)
+        shape = self._position.shape
+        self._speeding, self._braking, self._gain = np.zeros(shape), np.zeros(shape), np.zeros(shape)
+
+    def set(self, rows: np.ndarray, parameters: DynamicsParameters) -> None:
+        dt = self._batch.model.opt.timestep
+        limit, friction = parameters["effort_limit"], parameters["joint_friction"]
+        # Friction takes its share of the effort when the motor speeds a joint up, and helps when it brakes.
+        self._speeding[rows], self._braking[rows] = dt * np.maximum(limit - friction, 0.0), dt * (limit + friction)
+        gain = np.minimum(parameters["velocity_gain"], 1.0)
+        self._gain[rows] = gain / (gain + self._substeps * (1.0 - gain))  # the time constant stays the same
+
+    def step(self, command: np.ndarray) -> None:
+        dt = self._batch.model.opt.timestep
+        position, velocity = self._position.copy(), self._velocity.copy()
+        effort = np.where((command - velocity) * velocity < 0.0, self._braking, self._speeding)
+        for _ in range(self._substeps):
+            self._batch.forward()
+            free = np.clip(velocity + dt * self._acceleration, -FASTEST, FASTEST)
+            target = free + self._gain * (command - free)
+            low, high = limit_velocity(self._lower - position, dt), -limit_velocity(position - self._upper, dt)
+            velocity = motor_velocity(self._mass[:, self._places], free, target, effort, low, high)
+            velocity = np.clip(velocity, -FASTEST, FASTEST)
+            position += dt * velocity
+            self._position[:], self._velocity[:] = position, velocity
+
+
+class _Servo:
+    """Velocity actuators whose gain follows the joint's inertia, so that the time constant stays the same."""
+
+    def __init__(self, batch: Batch, substeps: int, control_dt: float, time_constant: float) -> None:
+        self._batch, self._substeps, self._dt, self._fastest = batch, substeps, control_dt, time_constant
+        self._friction, self._effort = batch.expand("dof_frictionloss"), batch.expand("actuator_forcerange")
+        self._gain, self._bias = batch.expand("actuator_gainprm"), batch.expand("actuator_biasprm")
+        self._mass = batch.bind("M")
+        self._own = batch.model.M_rowadr + batch.model.M_rownnz - 1  # the diagonal of the mass matrix
+        self._time_constant = np.zeros(batch.bind("qpos").shape)
+
+    def set(self, rows: np.ndarray, parameters: DynamicsParameters) -> None:
+        self._friction[rows] = parameters["joint_friction"]
+        self._effort[rows, :, 0], self._effort[rows, :, 1] = -parameters["effort_limit"], parameters["effort_limit"]
+        gain = np.clip(parameters["velocity_gain"], 1e-6, 1.0)
+        self._time_constant[rows] = self._fastest + self._dt * (1.0 - gain) / gain
+
+    def step(self, command: np.ndarray) -> None:
+        self._batch.forward(stage=int(mujoco.mjtStage.mjSTAGE_POS))
+        gain = self._mass[:, self._own] / self._time_constant
+        self._gain[:, :, 0], self._bias[:, :, 2] = gain, -gain
+        self._batch.ctrl = command
+        self._batch.step(nstep=self._substeps)
+
+
+def _make_model(spec: RobotSpec, motor: str, time_step: float) -> "mujoco.MjModel":
+    try:
+        made = mujoco.MjSpec.from_string(urdf.without_shapes(spec.urdf, spec.joints).decode())
+        made.compiler.fusestatic = False  # a link keeps its mass to itself
+        for joint in made.joints:
+            joint.actfrclimited = False  # the effort limit is the motor's, each robot's own
+            if motor == "servo":
+                actuator = made.add_actuator(name=joint.name, target=joint.name)
+                actuator.trntype, actuator.biastype = mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtBias.mjBIAS_AFFINE
+                actuator.forcelimited, actuator.forcerange = True, [-1.0, 1.0]
+        model = made.compile()
+    except ValueError as error:
+        raise UserError(f"{spec.urdf}: MuJoCo cannot load it: {' '.join(str(error).split())}") from error
+    model.opt.timestep = time_step
+    model.opt.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    off = mujoco.mjtDisableBit
+    # A warm start would be part of the state; friction and limits are in the impulses.
+    model.opt.disableflags |= off.mjDSBL_WARMSTART if motor == "servo" else off.mjDSBL_CONSTRAINT
+    return model

@@ -1,0 +1,170 @@
+"""MuJoCo beside PyBullet, by the same motor law; its own servo; and what it refuses."""
+
+import dataclasses
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pybullet as bullet
+import pytest
+
+from physai.errors import UserError
+from physai.physics.mujoco import MuJoCoPhysics
+from physai.physics.pybullet import PyBulletPhysics
+from physai.robots import RobotSpec
+from tests.physics.conftest import ENGINES
+from tests.physics.moving import DT, commands, dynamics, reset_all, resting, run, start, wild
+
+STEPS = 200
+
+
+class Patient(PyBulletPhysics):
+    """PyBullet that solves until joints agree; by itself it ends a little before, in an order of its own."""
+
+    def __init__(self, *arguments):
+        super().__init__(*arguments)
+        for world in self._worlds:
+            bullet.setPhysicsEngineParameter(
+                numSolverIterations=1000, solverResidualThreshold=0, physicsClientId=world.client
+            )
+
+
+@pytest.fixture(scope="module")
+def kuka(kuka_reacher):
+    return RobotSpec.from_config(kuka_reacher.robot)
+
+
+@pytest.fixture(scope="module")
+def seven(kuka_reacher):
+    """The KUKA with all its joints."""
+    joints = [f"lbr_iiwa_joint_{number}" for number in range(1, 8)]
+    changes = {"joints": joints, "home": [0.0] * 7, "command_limit": [0.5] * 7}
+    return RobotSpec.from_config(kuka_reacher.robot.model_copy(update=changes))
+
+
+def wandering(spec, robots, random):
+    """Commands that change smoothly, [T, N, n]."""
+    frequency, phase = random.uniform([[[0.1]]] * 2, [[[1.0]], [[2 * np.pi]]], (2, robots, len(spec.joints)))
+    time = DT * np.arange(STEPS)[:, None, None]
+    return spec.command_limit * np.sin(2 * np.pi * frequency * time + phase)
+
+
+def apart(spec, begin, parameters, given, substeps=1, pybullet=PyBulletPhysics):
+    """How far the engines' joints are apart, rad, RMS."""
+    ways = []
+    for made in (pybullet(spec, len(given[0]), DT, substeps), ENGINES["impulse"](spec, len(given[0]), DT, substeps)):
+        reset_all(made, begin, parameters)
+        ways.append(run(made, given)[:, 0])
+        made.close()
+    return np.sqrt(np.mean((ways[1] - ways[0]) ** 2))
+
+
+@pytest.mark.parametrize("kind", [dynamics, wild])
+@pytest.mark.parametrize("substeps", [1, 4])
+def test_robots_go_where_they_go_in_pybullet(spec, kind, substeps):
+    random = np.random.default_rng(0)
+    parameters = kind(spec, 16, random) if kind is wild else kind(spec, 16)
+    begin, given = start(spec, 16, random), wandering(spec, 16, random)
+    assert apart(spec, begin, parameters, given, substeps, Patient) < 1e-4
+    assert apart(spec, begin, parameters, given, substeps) < 5e-3
+
+
+def test_seven_joints_go_where_they_go_in_pybullet(seven):
+    random = np.random.default_rng(0)
+    begin, given = start(seven, 8, random), wandering(seven, 8, random)
+    parameters = wild(seven, 8, random)
+    parameters["effort_limit"] = np.full((8, 7), 300.0)
+    assert apart(seven, begin, parameters, given[:100], pybullet=Patient) < 1e-4
+
+
+def test_joints_run_into_their_limits_as_in_pybullet(planar):
+    random = np.random.default_rng(0)
+    begin = resting(16, [0.0, 2.4])
+    given = wandering(planar, 16, random)
+    given[:, :, 1] = np.abs(given[:, :, 1])
+    assert apart(planar, begin, dynamics(planar, 16), given) < 3e-3
+
+
+@pytest.mark.parametrize("motor", ["impulse", "servo"])
+def test_neither_companions_nor_threads_change_a_bit(spec, motor):
+    random = np.random.default_rng(0)
+    parameters, begin = wild(spec, 20, random), start(spec, 20, random)
+    given = commands(spec, 60, 20, random)
+    ways = []
+    for rows, threads in ((slice(0, 20), 1), (slice(0, 20), 2), (slice(7, 8), 1)):
+        some = dataclasses.replace(
+            begin, joint_position=begin.joint_position[rows], joint_velocity=begin.joint_velocity[rows]
+        )
+        made = MuJoCoPhysics(
+            spec, len(some.joint_position), DT, motor=motor, motor_time_constant=0.015, threads=threads
+        )
+        reset_all(made, some, {key: value[rows] for key, value in parameters.items()})
+        ways.append(run(made, given[:, rows]))
+    np.testing.assert_array_equal(ways[0], ways[1])
+    np.testing.assert_array_equal(ways[0][:, :, 7:8], ways[2])
+
+
+@pytest.mark.parametrize("substeps", [1, 20])
+@pytest.mark.parametrize("fastest", [0.015, 0.05])
+def test_a_servo_closes_in_with_its_time_constant(planar, substeps, fastest):
+    gain = np.array([1.0, 0.5])
+    physics = MuJoCoPhysics(planar, 2, DT, substeps, motor="servo", motor_time_constant=fastest, threads=1)
+    parameters = dynamics(planar, 2, velocity_gain=gain, effort_limit=100.0, joint_friction=0.0, joint_damping=0.0)
+    reset_all(physics, resting(2), parameters)
+    position = run(physics, np.tile([1.0, 0.0], (100, 2, 1)))[-1, 0, :, 0]
+    behind = 100 * DT - position  # rad; at 1 rad/s, what a first-order lag loses is its time constant in seconds
+    np.testing.assert_allclose(behind, fastest + DT * (1 - gain) / gain, rtol=0.1)
+
+
+def test_a_servo_s_effort_is_limited_and_dry_friction_holds_what_is_too_weak_for_it(planar):
+    physics = ENGINES["servo"](planar, 3, DT)
+    parameters = dynamics(planar, 3, effort_limit=[5.0, 0.5, 0.5], joint_friction=[0.05, 0.05, 0.6])
+    reset_all(physics, resting(3), parameters)
+    strong, weak, stuck = run(physics, np.tile([1.0, 0.0], (3, 3, 1)))[2, 1, :, 0]
+    assert strong > 2 * weak > 0.1
+    assert abs(stuck) < 0.02  # MuJoCo's friction creeps
+
+
+def test_a_servo_pushes_a_joint_little_beyond_its_limit(planar):
+    physics = ENGINES["servo"](planar, 1, DT)
+    reset_all(physics, resting(1, [0.0, 2.4]))
+    position = run(physics, np.tile([0.0, 1.0], (50, 1, 1)))[:, 0, 0, 1]
+    assert 2.59 < position[-1] < position.max() < 2.63
+
+
+@pytest.mark.slow
+def test_a_thousand_robots_have_masses_of_their_own(planar):
+    physics = ENGINES["impulse"](planar, 1000, DT)
+    parameters = dynamics(planar, 1000, link_mass=np.linspace(0.5, 2, 1000), effort_limit=0.5)
+    reset_all(physics, resting(1000), parameters)
+    speed = run(physics, np.tile([1.0, 0.0], (3, 1000, 1)))[-1, 1, :, 0]
+    assert (np.diff(speed) < 0).all()
+
+
+def test_a_urdf_that_mujoco_cannot_load_names_the_element(planar, tmp_path):
+    lopsided = planar.urdf.read_text().replace('izz="0.00319"', 'izz="0.9"')
+    (tmp_path / "arm.urdf").write_text(lopsided)
+    with pytest.raises(UserError, match=r"arm\.urdf: MuJoCo cannot load it: .*link2"):
+        ENGINES["impulse"](dataclasses.replace(planar, urdf=tmp_path / "arm.urdf"), 1, DT)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("found", "line"),
+    [
+        ("raise ImportError('core and mujoco of\\n unequal version')", "error: core and mujoco of unequal version"),
+        ("from mujoco import _gone", "error: "),
+    ],
+    ids=["mixed", "half"],
+)
+def test_a_mujoco_that_is_not_whole_ends_in_one_line(tmp_path, found, line):
+    (tmp_path / "mujoco").mkdir()
+    (tmp_path / "mujoco" / "__init__.py").write_text(found)
+    environment = os.environ | {"PYTHONPATH": f"{tmp_path}:{os.environ.get('PYTHONPATH', '')}"}
+    command = [sys.executable, "-m", "physai.train", "physics=mujoco", f"hydra.run.dir={tmp_path}/run"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120, env=environment)
+    assert done.returncode == 2
+    assert done.stderr.startswith(line)
+    assert done.stderr.count("\n") == 1
+    assert not (tmp_path / "run").exists()
