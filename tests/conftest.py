@@ -45,7 +45,6 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     for item in items:
         if not {"position_run", "recurrent_run", "small_run"}.isdisjoint(getattr(item, "fixturenames", ())):
             item.add_marker(pytest.mark.slow)  # a run of their own is made for them
-    items.sort(key=lambda item: item.get_closest_marker("slow") is None)  # else workers wait for the last long ones
     if (chosen := config.getoption("--realtime")) is None:
         return
     wanted = [item for item in items if (item.get_closest_marker("realtime") is not None) == (chosen == "only")]
