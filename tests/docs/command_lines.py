@@ -85,7 +85,8 @@ def _check_hydra(name: str, model: Any, given: Sequence[str]) -> None:
         OmegaConf.to_container(config.hydra.launcher, resolve=False)
         validated = validate(model, OmegaConf.masked_copy(config, [key for key in config if key != "hydra"]))
         if isinstance(getattr(validated, "env", None), dict):
-            validate(EnvConfig, DictConfig(validated.env))
+            engine = validated.env["physics"] or compose("train", []).physics  # None stands for that of the run
+            validate(EnvConfig, DictConfig(validated.env | {"physics": engine}))
 
 
 def _check_node(node: str, given: Sequence[str]) -> None:
