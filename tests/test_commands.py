@@ -312,11 +312,7 @@ def test_an_env_that_is_chosen_stays_in_the_run_s_engine(run, copied):
             "env.physics: RosPhysics.__init__() missing 4 required positional arguments: 'homing_speed'",
         ),
         ("evaluate", ["run=run", "physics=mujoc"], "physics/mujoc: no such config; did you mean 'mujoco'?"),
-        (
-            "evaluate",
-            ["run=run", "env=ros_reacher", "physics=mujoco"],
-            "the robots of 'ros_reacher' come with their own",
-        ),
+        ("evaluate", ["run=run", "env=ros_reacher", "physics=mujoco"], "robots of 'ros_reacher' come with their own"),
         ("evaluate", [], "run=... is required"),
         ("play", ["run=run", "output=arm.avi"], "must end in .mp4 or .gif"),
         ("play", ["run=run", "render=windw"], "render: input should be 'video' or 'human'"),

@@ -4,9 +4,8 @@ import numpy as np
 
 FASTEST = 100.0  # rad/s; PyBullet lets no joint turn faster, before and after the motors
 _ERP = 0.2  # share of the way back to its limit that a joint goes in one substep
-_DEEPEST = (
-    0.04  # rad; a joint that is farther beyond its limit is stopped, and not pushed back (Bullet's split impulse)
-)
+# A joint that is farther beyond its limit is stopped, and not pushed back (Bullet's split impulse).
+_DEEPEST = 0.04  # rad
 _ROUNDS, _TOGETHER = 100, 10
 _EXACT = 1e-9  # rad/s, and a share of the impulses
 
