@@ -2,9 +2,10 @@
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 from omegaconf import DictConfig
+from pydantic import Field
 
 from physai import cli
 from physai.config import Config, Count, PackageName, Seed, validate
@@ -56,6 +57,7 @@ class EvaluateConfig(PolicyChoice):
     """``conf/evaluate.yaml``."""
 
     episodes: Count
+    in_a_row: Annotated[int, Field(ge=0)]
     seed: Seed | None
 
 
@@ -69,7 +71,8 @@ def _evaluate(node: DictConfig, _: Path) -> None:
     config = validate(EvaluateConfig, node)
     policy = config.load()
     seed = FINAL_SEED if config.seed is None else config.seed
-    summary = policy.evaluate(config.episodes, seed).summary() | {
+    figures = policy.evaluate(config.episodes, seed).summary() | policy.in_a_row(config.in_a_row, seed)
+    summary = figures | {
         "env": policy.config.env.name,
         "physics": policy.config.env.physics,
         "randomization": policy.randomization.name,

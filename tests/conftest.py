@@ -132,7 +132,7 @@ def recurrent_run(once: Callable[[str, Callable[[Path], None]], Path]) -> Path:
 
 def _train_and_export(*arguments: Any) -> None:
     *overrides, run = arguments
-    node = compose("train", [*overrides, "evaluation.episodes=200"])
+    node = compose("train", [*overrides, "evaluation.episodes=200", "evaluation.in_a_row=2"])
     (run / ".hydra").mkdir()
     (run / ".hydra" / "config.yaml").write_text(OmegaConf.to_yaml(node))
     run_training(validate(TrainConfig, node), run)

@@ -13,6 +13,7 @@ from physai.artifact import onnx
 from physai.deploy import Metadata, PolicyError, archive, read_metadata
 from physai.errors import UserError
 from physai.signals import Signal
+from physai.training.run import rate
 
 
 def show(path: Path) -> None:
@@ -47,7 +48,6 @@ def _read_onnx(path: Path) -> Metadata:
 def _summary(path: Path, metadata: Metadata) -> Table:
     raw = metadata.raw
     evaluation = raw["evaluation"]
-    low, high = evaluation["success_ci"]
     rows = {
         "robot": f"{metadata.robot}, end effector {raw['robot']['end_effector']}",
         "URDF SHA-256": raw["robot"]["urdf_sha256"],
@@ -55,8 +55,9 @@ def _summary(path: Path, metadata: Metadata) -> Table:
         "outputs": _shapes(metadata.outputs),
         "control rate": f"{metadata.control_rate:g} Hz",
         "goals": _goals(metadata),
-        "evaluation": f"{evaluation['success_rate']:.1%} success (95 % interval {low:.1%} to {high:.1%}) on "
-        f"{evaluation['episodes']:,} goals, randomization {evaluation['randomization']}",
+        "evaluation": f"on {evaluation['episodes']:,} goals, randomization {evaluation['randomization']}",
+        "success": rate(evaluation, "success"),
+        "settled": rate(evaluation, "settled"),
         "checkpoint": f"{raw['checkpoint']['which']}, {raw['checkpoint']['frames']:,} frames",
         "golden pairs": str(len(metadata.golden[metadata.goal.name])),
         "versions": ", ".join(f"{name} {version}" for name, version in raw["versions"].items()),

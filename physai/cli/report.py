@@ -43,7 +43,7 @@ class SweepReport(Callback):
         runs = sorted((path.parent.parent for path in folder.glob("*/.hydra/overrides.yaml")), key=_number)
         summaries = {run: _summary(run) for run in runs}
         table = Table(title=f"{folder}", title_justify="left")
-        for column in ("run", "differs by", "success", "steps", "frames", "seconds"):
+        for column in ("run", "differs by", "success", "settled", "steps", "frames", "seconds"):
             table.add_column(column, justify="left" if column in ("run", "differs by") else "right")
         overrides = {run: list(OmegaConf.load(run / ".hydra" / "overrides.yaml")) for run in runs}
         common = set.intersection(*map(set, overrides.values())) if len(runs) > 1 else set()
@@ -82,10 +82,11 @@ def _reason(run: Path) -> str:
 
 def _figures(summary: dict[str, Any] | None) -> list[str]:
     if summary is None:
-        return ["[red]failed[/red]", "", "", ""]
+        return ["[red]failed[/red]", "", "", "", ""]
     steps = summary["steps_to_goal"]
     return [
         f"{summary['success_rate']:.1%}",
+        f"{summary['settled_rate']:.1%}",
         "-" if steps is None else f"{steps:.0f}",
         f"{summary['frames']:,}",
         f"{summary['train_seconds']:.1f}",

@@ -18,7 +18,7 @@ from physai.tasks import Step, Task
 _TASK = ("goal", "region", "tolerances", "observation", "module", "max_steps", "success", "terminated", "rewards")
 _PHYSICS = ("reset", "step", "robot_state", "close")
 _STATE = (
-    *("goal", "last_command", "episode_length", "episode_rewards", "physics_parameters"),
+    *("goal", "last_action", "last_command", "episode_length", "episode_rewards", "physics_parameters"),
     *("within", "success", "started"),
 )
 
@@ -78,6 +78,7 @@ class Simulation:
         goal: [N, g].
         error: How far they are from it, one column a tolerance, [N, e].
         success: Whether the last step was one, [N, 1].
+        last_action: What was asked of them last, [N, n], in [-1, 1]; zeros when an episode begins.
         last_command: What the robots were told last, [N, n], rad/s or rad; where they stand when an episode begins.
         episode_length: Control steps since the last reset, [N, 1].
         episode_rewards: Sum of each term of the reward since the last reset, [N, terms].
@@ -109,10 +110,13 @@ class Simulation:
         self.goal: np.ndarray = np.zeros((num_envs, *self.task.goal.shape))
         self.physics_parameters: np.ndarray = self.layout.nominal.repeat(num_envs, 1).numpy()
         self.last_command = self._standing(self.state)
+        self.last_action = np.zeros(self.last_command.shape, np.float32)
         self.within = np.zeros(num_envs, np.int64)
         self.error = self.task.error(self.state, self.goal)
         self.success = np.zeros((num_envs, 1), bool)
-        self.reward_terms = tuple(self.task.rewards(self._step(self.last_command), self.success[:, 0]))
+        self.reward_terms = tuple(
+            self.task.rewards(self._step(self.last_command, self.last_action), self.success[:, 0])
+        )
         self.episode_length = np.zeros((num_envs, 1), np.int64)
         self.episode_rewards = np.zeros((num_envs, len(self.reward_terms)), np.float32)
 
@@ -154,6 +158,7 @@ class Simulation:
         self.state = self.physics.robot_state()
         standing = self._standing(self.state)[rows]
         self.last_command = _replaced(self.last_command, rows, standing)
+        self.last_action = _replaced(self.last_action, rows, 0.0)
         self._delay.reset(rows, standing, delay)
 
     def _start(self, rows: np.ndarray, ended: RobotState) -> RobotState:
@@ -188,6 +193,7 @@ class Simulation:
             only terminates.
         """
         command = self.joint_command.of_arrays(action, self.state.joint_position, self.last_command)
+        action = np.maximum(np.minimum(action, 1.0), -1.0)
         self.last_command, before = command, self.state
         self.state = self.physics.step(self._delay(command))
         length = self.episode_length + 1
@@ -199,12 +205,14 @@ class Simulation:
         self.error = self.task.error(self.state, self.goal)
         near = (self.error < self._tolerance).all(axis=1)
         self.within = np.where(near, self.within + 1, 0)
-        step = self._step(command)
+        step = self._step(command, action)
+        self.last_action = action
         success = self.task.success(step)
         terminated = self.task.terminated(step, success)
         rewards = np.stack(list(self.task.rewards(step, success).values()), axis=1).astype(np.float32)
         if rows is not None:
             self.within[rows], rewards[rows] = 0, 0.0
+            self.last_action[rows] = 0.0
             success, terminated = _replaced(success, rows, False), _replaced(terminated, rows, False)  # the task's own
         self.success, terminated = success[:, None], terminated[:, None]
         self.episode_length = length
@@ -212,8 +220,9 @@ class Simulation:
         truncated = (length >= self.task.max_steps) & ~terminated
         return rewards.sum(axis=1, keepdims=True), terminated, truncated
 
-    def _step(self, command: np.ndarray) -> Step:
-        return Step(self.state, command, self.goal, self.error, self.within * self.config.control_dt)
+    def _step(self, command: np.ndarray, action: np.ndarray) -> Step:
+        held = self.within * self.config.control_dt
+        return Step(self.state, command, action, self.last_action, self.goal, self.error, held)
 
     def observe(self) -> np.ndarray:
         """Return what a policy sees of the true state, [N, o], float32."""

@@ -17,7 +17,7 @@ _BINS = 60
 
 
 def plot_runs(runs: Sequence[Path], output: Path) -> None:
-    """Draw episode return (left) and length (right) over frames, smoothed, with their spread.
+    """Draw episode return and length over frames, smoothed, with their spread; and the evaluations' rates.
 
     One run shows the mean of its episodes and the band of their 10th to 90th percentile. Runs that differ only in
     their seed become one curve: the mean over runs, in the band from the lowest to the highest of them.
@@ -32,12 +32,16 @@ def plot_runs(runs: Sequence[Path], output: Path) -> None:
     groups: dict[str, list[pd.DataFrame]] = {}
     for run in runs:
         groups.setdefault(_label(run), []).append(_episodes(run))
-    figure, axes = plt.subplots(1, 2, figsize=(11, 4.2), layout="constrained")
-    for axis, column, title in zip(
-        axes, ("return", "length"), ("Episode return", "Episode length (steps)"), strict=True
-    ):
-        for label, members in groups.items():
-            _curve(axis, members, column, label)
+    figure, axes = plt.subplots(1, 3, figsize=(15, 4.2), layout="constrained")
+    for label, members in groups.items():
+        _curve(axes[0], members, "return", label)
+        _curve(axes[1], members, "length", label)
+    colors = {label: line.get_color() for label, line in zip(groups, axes[0].lines, strict=True)}
+    for run in runs:
+        _rates(axes[2], run, colors[_label(run)])
+    axes[2].set_ylim(-2, 102)
+    titles = "Episode return", "Episode length (steps)", "Success (solid) and settled (dashed), % of test goals"
+    for axis, title in zip(axes, titles, strict=True):
         axis.set_title(title)
         axis.set_xlabel("frames")
         axis.grid(alpha=0.25)
@@ -62,6 +66,20 @@ def _episodes(run: Path) -> pd.DataFrame:
     if episodes.empty:
         raise UserError(f"{run}: no episode has ended yet, there is nothing to draw")
     return episodes
+
+
+def _rates(axis: plt.Axes, run: Path, color: str) -> None:
+    """What the evaluations while training found; a run may not have had one yet."""
+    path = run / "metrics.csv"
+    if not path.is_file():
+        return
+    columns = {"evaluation/success_rate": "-", "evaluation/settled_rate": "--"}
+    try:
+        metrics = pd.read_csv(path, usecols=["frames", *columns]).astype(float).dropna()
+    except ValueError as error:
+        raise UserError(f"{path}: the run's metrics are damaged") from error
+    for column, style in columns.items():
+        axis.plot(metrics["frames"], 100 * metrics[column], style, marker=".", color=color, linewidth=1.5)
 
 
 def _label(run: Path) -> str:

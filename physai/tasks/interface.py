@@ -35,6 +35,8 @@ class Step:
     Attributes:
         state: What the robots do now.
         command: What they were told, rad/s or rad, [N, n].
+        action: What the policy asked for, in [-1, 1], [N, n]: a share of each joint's largest command.
+        last_action: The same of the step before, [N, n]; zeros when an episode begins.
         goal: [N, g].
         error: How far they are from it, one column a tolerance, [N, e].
         held: For how long all errors have been within their tolerances without a break, s, [N].
@@ -42,6 +44,8 @@ class Step:
 
     state: RobotState
     command: np.ndarray
+    action: np.ndarray
+    last_action: np.ndarray
     goal: np.ndarray
     error: np.ndarray
     held: np.ndarray

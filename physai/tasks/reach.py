@@ -69,14 +69,16 @@ class ReachObservation(ObservationModule):
 
 
 class Reach(Task):
-    """Goals on a ring around the base; reward is minus the distance, plus a bonus at the goal, which ends the episode.
+    """Goals on a ring around the base; reward is minus the distance, plus a bonus for success, which ends the episode.
 
     Args:
         spec: The robot.
         kinematics: Its forward kinematics.
         goal_radius: Inner and outer radius of the ring, m.
         tolerance: Distance that counts as reached, m.
-        success_reward: Bonus at the goal.
+        success_reward: Bonus for success.
+        settle: How long the end effector must stay there to succeed, s; with 0 touching the goal is enough.
+        smoothness: Weight of what changes of the action cost: their mean over the joints, as a share of the action.
         max_steps: Control steps until an episode is truncated.
 
     Raises:
@@ -90,6 +92,8 @@ class Reach(Task):
         goal_radius: Annotated[list[PositiveFloat], Field(min_length=2, max_length=2)],
         tolerance: PositiveFloat,
         success_reward: NonNegativeFloat,
+        settle: NonNegativeFloat,
+        smoothness: NonNegativeFloat,
         max_steps: Count,
     ) -> None:
         inner, outer = goal_radius
@@ -106,21 +110,24 @@ class Reach(Task):
         self.module = ReachObservation(spec, kinematics, tolerance)
         self.observation = _observation(spec, self.goal, kinematics.reach)
         self.max_steps = max_steps
-        self._success_reward = success_reward
+        self._success_reward, self._settle, self._smoothness = success_reward, settle, smoothness
         self._end_effector = EndEffector(kinematics)
         self._continuous = spec.continuous.nonzero()[0]
 
     def success(self, step: Step) -> np.ndarray:
-        """Whether the end effector is near enough."""
-        return step.held > 0
+        """Whether the end effector is near enough, and has been for long enough."""
+        return (step.held > 0) & (step.held >= self._settle - 1e-9)
 
     def terminated(self, step: Step, success: np.ndarray) -> np.ndarray:
-        """Reaching the goal ends the episode."""
+        """Success ends the episode."""
         return success
 
     def rewards(self, step: Step, success: np.ndarray) -> dict[str, np.ndarray]:
-        """Minus the distance, m, and the bonus."""
-        return {"distance": -step.error[:, 0], "success": self._success_reward * success}
+        """Minus the distance, m, the bonus, and what changing the action costs, if it does."""
+        terms = {"distance": -step.error[:, 0], "success": self._success_reward * success}
+        if self._smoothness:
+            terms["smoothness"] = -self._smoothness * np.abs(step.action - step.last_action).mean(axis=1)
+        return terms
 
     # The same as the module says, without the cost of torch's calls.
 

@@ -9,7 +9,7 @@ import torch
 from physai.errors import UserError
 from physai.files import write_atomically
 
-_FORMAT = 4
+_FORMAT = 5
 
 
 def save(path: Path, content: dict[str, Any]) -> None:

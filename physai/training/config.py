@@ -25,6 +25,7 @@ class EvaluationConfig(Config):
     every_frames: Count
     goals: Count
     episodes: Count
+    in_a_row: Annotated[int, Field(ge=0)]
     randomization: RandomizationConfig
 
 

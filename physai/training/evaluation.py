@@ -1,7 +1,9 @@
-"""Judging a policy: one deterministic episode per goal, all goals at once."""
+"""Judging a policy: deterministic episodes, all goals at once; and goals one after the other."""
 
+import math
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
@@ -10,24 +12,52 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from physai.envs.make import TransformedRobotEnv
 
 MAX_ROBOTS = 1000
+ROBOTS_IN_A_ROW = 64
+SETTLED = 0.5  # s, at the end of an episode's time
+
+
+def wilson(success: Tensor) -> tuple[float, float]:
+    """Return the 95 % confidence interval of a rate (Wilson, 1927).
+
+    Args:
+        success: Of independent episodes [E], or of E robots that had G episodes each, one after the other, [E, G].
+            Those of one robot depend on each other: then their number counts for less, by the design effect (Kish,
+            1965).
+    """
+    from scipy.stats import binomtest  # takes half a second to import: nobody waits for it before the first frame
+
+    successes, episodes = int(success.sum()), success.numel()
+    if success.ndim > 1 and len(success) > 1 and 0 < successes < episodes:
+        rate, of_robots = successes / episodes, success.double().mean(dim=1)
+        effect = max(1.0, success.shape[1] * float(of_robots.var()) / (rate * (1.0 - rate)))
+        successes, episodes = round(successes / effect), round(episodes / effect)
+    interval = binomtest(successes, episodes).proportion_ci(method="wilson")
+    return float(interval.low), float(interval.high)
 
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Results of E episodes, each [E].
+    """Results of E episodes, each [E]; and how they moved, in T steps each of n joints, [E, T·n].
 
     Attributes:
         success: Whether the last step of the episode was a success.
+        settled: Whether all errors were within their tolerances in the last ``SETTLED`` s of its time, in which the
+            robot was watched on after a success.
         length: Control steps until the first success of an episode that ended with one, or until its end.
         error: The task's largest error at the end, of those in the unit of its first one.
         episode_return: Sum of rewards.
+        action_change: By how much the action changed from step to step; 1 is a joint's largest command.
+        acceleration: Mean of each control period, rad/s².
         unit: Of the error.
     """
 
     success: Tensor
+    settled: Tensor
     length: Tensor
     error: Tensor
     episode_return: Tensor
+    action_change: Tensor
+    acceleration: Tensor
     unit: str
 
     @property
@@ -37,11 +67,18 @@ class Evaluation:
 
     @property
     def success_ci(self) -> tuple[float, float]:
-        """95 % confidence interval of the success rate (Wilson, 1927)."""
-        from scipy.stats import binomtest  # takes half a second to import: nobody waits for it before the first frame
+        """95 % confidence interval of the success rate."""
+        return wilson(self.success)
 
-        interval = binomtest(int(self.success.sum()), len(self.success)).proportion_ci(method="wilson")
-        return float(interval.low), float(interval.high)
+    @property
+    def settled_rate(self) -> float:
+        """Share of goals that the robots stayed at."""
+        return float(self.settled.double().mean())
+
+    @property
+    def settled_ci(self) -> tuple[float, float]:
+        """95 % confidence interval of the settled rate."""
+        return wilson(self.settled)
 
     def summary(self) -> dict[str, float | list[float] | str | None]:
         """The figures that scripts rely on.
@@ -52,15 +89,27 @@ class Evaluation:
         return {
             "success_rate": self.success_rate,
             "success_ci": list(self.success_ci),
+            "settled_rate": self.settled_rate,
+            "settled_ci": list(self.settled_ci),
             "steps_to_goal": float(reached.double().mean()) if len(reached) else None,
             "final_distance": float(self.error.double().mean()),
             "distance_unit": self.unit,
             "return": float(self.episode_return.double().mean()),
+            **_mean_and_p99("action_change", self.action_change),
+            **_mean_and_p99("acceleration", self.acceleration),
         }
+
+
+def _mean_and_p99(name: str, values: Tensor) -> dict[str, float]:
+    array = values.double().numpy()
+    return {f"{name}_mean": float(array.mean()), f"{name}_p99": float(np.quantile(array, 0.99))}
 
 
 def evaluate(policy: TensorDictModuleBase, env: TransformedRobotEnv, episodes: int, seed: int) -> Evaluation:
     """Let a policy act deterministically for one episode per goal; the goals follow from the seed alone.
+
+    After a success a robot goes on towards the same goal for the rest of the episode's time: nothing else shows
+    whether it stays there.
 
     Args:
         policy: Writes ``action``.
@@ -70,30 +119,70 @@ def evaluate(policy: TensorDictModuleBase, env: TransformedRobotEnv, episodes: i
     """
     env.set_seed(seed)
     rounds = [_one_round(policy, env) for _ in range(-(-episodes // env.simulation.num_envs))]
-    columns = (torch.cat(column)[:episodes] for column in zip(*rounds, strict=True))
-    success, length, error, episode_return = columns
-    return Evaluation(success, length, error, episode_return, env.simulation.task.tolerances[0].unit)
+    columns = {key: torch.cat([each[key] for each in rounds])[:episodes] for key in rounds[0]}
+    return Evaluation(**columns, unit=env.simulation.task.tolerances[0].unit)
 
 
 @torch.no_grad()
-def _one_round(policy: TensorDictModuleBase, env: TransformedRobotEnv) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    tensordict = env.reset()
-    tolerances = env.simulation.task.tolerances
-    columns = [i for i, tolerance in enumerate(tolerances) if tolerance.unit == tolerances[0].unit]
-    robots = env.simulation.num_envs
-    finished, success = torch.zeros(2, robots, dtype=torch.bool)
+def _one_round(policy: TensorDictModuleBase, env: TransformedRobotEnv) -> dict[str, Tensor]:
+    """Return the columns of an Evaluation, but for the unit."""
+    simulation, tensordict = env.simulation, env.reset()
+    task, dt, robots = simulation.task, simulation.config.control_dt, simulation.num_envs
+    columns = [i for i, tolerance in enumerate(task.tolerances) if tolerance.unit == task.tolerances[0].unit]
+    finished, success, failed = torch.zeros(3, robots, dtype=torch.bool)
     length, first = torch.zeros(2, robots, dtype=torch.int64)
     error, episode_return = torch.zeros(2, robots)
+    changes, accelerations = [], []
     with set_exploration_type(ExplorationType.DETERMINISTIC):
-        while not finished.all():
+        for _ in range(task.max_steps):
+            action, velocity = simulation.last_action, simulation.state.joint_velocity
             tensordict = env.step(policy(tensordict)).get("next")
+            changes.append(np.abs(simulation.last_action - action))
+            accelerations.append(np.abs(simulation.state.joint_velocity - velocity) / dt)
             succeeds, steps = tensordict.get("success")[:, 0], tensordict.get("episode_length")[:, 0]
             first = torch.where(succeeds & (first == 0), steps, first)
-            # Robots that are done idle on until the last one is; only their first episode counts.
+            failed |= tensordict.get("terminated")[:, 0] & ~succeeds
             now = tensordict.get("done")[:, 0] & ~finished
             finished |= now
             success[now] = succeeds[now]
             length[now] = torch.where(succeeds, first, steps)[now]
-            error[now] = torch.from_numpy(env.simulation.error[:, columns].max(axis=1)).float()[now]
+            error[now] = torch.from_numpy(simulation.error[:, columns].max(axis=1)).float()[now]
             episode_return[now] = tensordict.get("episode_rewards").sum(dim=1)[now]
-    return success, length, error, episode_return
+    stayed = simulation.within >= min(math.ceil(SETTLED / dt - 1e-9), task.max_steps)
+    return {
+        "success": success,
+        "settled": torch.from_numpy(stayed) & ~failed,
+        "length": length,
+        "error": error,
+        "episode_return": episode_return,
+        "action_change": torch.from_numpy(np.concatenate(changes, axis=1)).float(),
+        "acceleration": torch.from_numpy(np.concatenate(accelerations, axis=1)).float(),
+    }
+
+
+@torch.no_grad()
+def evaluate_in_a_row(policy: TensorDictModuleBase, env: TransformedRobotEnv, goals: int, seed: int) -> Tensor:
+    """Give each robot goals one after the other, and never bring it home in between.
+
+    What one episode hides shows here: an arm that turns into its joint limits, goal by goal.
+
+    Args:
+        policy: Writes ``action``.
+        env: E robots whose episodes begin where their last ones ended (``start.carried_over=1``).
+        goals: How many each robot gets, G.
+        seed: Seeds goals, starts, and whatever the env randomizes.
+
+    Returns:
+        Whether the robots succeeded, [E, G].
+    """
+    env.set_seed(seed)
+    tensordict, robots = env.reset(), env.simulation.num_envs
+    success, played = torch.zeros(robots, goals, dtype=torch.bool), torch.zeros(robots, dtype=torch.int64)
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        while (played < goals).any():
+            after, tensordict = env.step_and_maybe_reset(policy(tensordict))
+            after = after.get("next")
+            ended = (after.get("done")[:, 0] & (played < goals)).nonzero()[:, 0]
+            success[ended, played[ended]] = after.get("success")[ended, 0]
+            played[ended] += 1
+    return success

@@ -53,9 +53,11 @@ class CsvLog:
 EPISODE_COLUMNS = ("frame", "return", "length", "success")
 EVALUATION_COLUMNS = (
     "evaluation/success_rate",
+    "evaluation/settled_rate",
     "evaluation/steps_to_goal",
     "evaluation/final_distance",
     "evaluation/return",
+    *(f"evaluation/{what}_{figure}" for what in ("action_change", "acceleration") for figure in ("mean", "p99")),
 )
 TIME_COLUMNS = ("time/seconds", "time/collect", "time/update", "time/frames_per_second")
 

@@ -25,7 +25,14 @@ from physai.training import checkpoint
 from physai.training.agent import Agent, load_policy_state, make_actor, make_evaluation_env, make_logger
 from physai.training.callbacks import CheckpointCallback, EvaluationCallback, LogCallback, ProgressCallback
 from physai.training.config import TrainConfig
-from physai.training.evaluation import MAX_ROBOTS, Evaluation, evaluate
+from physai.training.evaluation import (
+    MAX_ROBOTS,
+    ROBOTS_IN_A_ROW,
+    Evaluation,
+    evaluate,
+    evaluate_in_a_row,
+    wilson,
+)
 from physai.training.stopping import Interrupted, stop_signals
 from physai.training.trainer import Trainer
 
@@ -84,8 +91,10 @@ def run_training(
         if stop:
             raise Interrupted(stop[0])
         print(f"Evaluating the best policy on {config.evaluation.episodes:,} goals it has never seen ...", flush=True)
-        result = TrainedPolicy(run_dir, "best", config=config).evaluate(config.evaluation.episodes)
-        summary = _summary(config, trainer, evaluation.best_frames, result)
+        best = TrainedPolicy(run_dir, "best", config=config)
+        result = best.evaluate(config.evaluation.episodes)
+        figures = result.summary() | best.in_a_row(config.evaluation.in_a_row)
+        summary = _summary(config, trainer, evaluation.best_frames, figures)
         write_atomically(done, json.dumps(summary, indent=2).encode())
     if stop:  # too late to matter for this run, but a sweep must end
         raise Interrupted(stop[0])
@@ -166,11 +175,14 @@ class TrainedPolicy:
         if type(self.frames) is not int:
             raise UserError(f"{run_dir}: the checkpoint '{which}' does not say how many frames it has learned from")
 
-    def deploy(self, num_envs: int, seed: int) -> tuple[TensorDictModuleBase, TransformedRobotEnv]:
-        """Build the actor, and an env with the statistics that it was trained with."""
-        env = make_evaluation_env(self.config, self.randomization, num_envs, seed)
+    def deploy(
+        self, num_envs: int, seed: int, env_config: EnvConfig | None = None
+    ) -> tuple[TensorDictModuleBase, TransformedRobotEnv]:
+        """Build the actor, and an env with the statistics that it was trained with; the run's, if no other is given."""
+        config = self.config if env_config is None else self.config.model_copy(update={"env": env_config})
+        env = make_evaluation_env(config, self.randomization, num_envs, seed)
         try:
-            actor = make_actor(self.config, env)
+            actor = make_actor(config, env)
             load_policy_state(actor, env, self._state)
         except BaseException:
             env.close()
@@ -185,12 +197,26 @@ class TrainedPolicy:
         finally:
             env.close()
 
+    def in_a_row(self, goals: int, seed: int = FINAL_SEED) -> dict[str, Any]:
+        """Evaluate it on so many goals one after the other; return the figures, none for robots not simulated."""
+        if not goals or not self.config.env.simulated:
+            return {}
+        start = self.config.env.start.model_copy(update={"carried_over": 1.0})
+        carried = self.config.env.model_copy(update={"start": start})
+        actor, env = self.deploy(ROBOTS_IN_A_ROW, seed, carried)
+        try:
+            success = evaluate_in_a_row(actor, env, goals, seed)
+        finally:
+            env.close()
+        rate = float(success.double().mean())
+        return {"in_a_row": goals, "in_a_row_rate": rate, "in_a_row_ci": list(wilson(success))}
 
-def _summary(config: TrainConfig, trainer: Trainer, best_frames: int, result: Evaluation) -> dict[str, Any]:
+
+def _summary(config: TrainConfig, trainer: Trainer, best_frames: int, figures: dict[str, Any]) -> dict[str, Any]:
     clock = trainer.clock
     return {
         "env": config.env.name,
-        **result.summary(),
+        **figures,
         "randomization": config.evaluation.randomization.name,
         "frames": clock.frames,
         "best_frames": best_frames,
@@ -211,15 +237,28 @@ def git_commit() -> str | None:
         return None
 
 
+def rate(summary: dict[str, Any], name: str) -> str:
+    """A rate of a summary with its interval, for people."""
+    low, high = summary[f"{name}_ci"]
+    return f"{summary[f'{name}_rate']:.1%}   (95 % interval {low:.1%} to {high:.1%})"
+
+
+def _mean_and_p99(summary: dict[str, Any], name: str) -> str:
+    return f"{summary[f'{name}_mean']:.2g} (99 % are below {summary[f'{name}_p99']:.2g})"
+
+
 def print_summary(summary: dict[str, Any], title: str) -> None:
     """Show the figures that matter as a table."""
-    low, high = summary["success_ci"]
     steps = summary["steps_to_goal"]
-    rows = {
-        "success rate": f"{summary['success_rate']:.1%}   (95 % interval {low:.1%} to {high:.1%})",
+    rows = {"success rate": rate(summary, "success"), "settled": rate(summary, "settled")}
+    if "in_a_row" in summary:
+        rows[f"{summary['in_a_row']} in a row"] = rate(summary, "in_a_row")
+    rows |= {
         "steps to goal": "none reached" if steps is None else f"{steps:.1f}",
         "final distance": f"{summary['final_distance']:.3f} {summary['distance_unit']}",
         "return": f"{summary['return']:.2f}",
+        "change of action": f"{_mean_and_p99(summary, 'action_change')} a step",
+        "acceleration": f"{_mean_and_p99(summary, 'acceleration')} rad/s²",
         "randomization": summary["randomization"],
     }
     if "train_seconds" in summary:

@@ -85,6 +85,7 @@ class Trainer:
         self.folder = folder
         self.callbacks = callbacks
         self.clock = Clock()
+        self._untimed = 0.0  # s, since the last batch was learned from
 
     @property
     def done(self) -> bool:
@@ -101,7 +102,7 @@ class Trainer:
         """Context whose time is not the run's."""
         started = time.perf_counter()
         yield
-        self.clock.seconds -= time.perf_counter() - started
+        self._untimed += time.perf_counter() - started
 
     def fit(self, stop: Sequence[int] = ()) -> None:
         """Train until the end, or until there is something in ``stop``, and save then.
@@ -127,9 +128,10 @@ class Trainer:
                     "time/update": updated - collected,
                     "time/frames_per_second": batch.numel() / (updated - started),
                 }
+                self._untimed = 0.0
                 for callback in self.callbacks:
                     callback.after_batch(self, batch, values)
-                self.clock.seconds += time.perf_counter() - updated
+                self.clock.seconds += time.perf_counter() - updated - self._untimed
             if stop:
                 self.save()
         except NonFiniteError as error:

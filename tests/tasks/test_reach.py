@@ -19,7 +19,8 @@ RADII = [0.3, 0.53]
 def reach(config, goal_radius=RADII) -> Reach:
     """The task of an env's robot."""
     spec = RobotSpec.from_config(config.robot)
-    return Reach(spec, ForwardKinematics(spec), goal_radius, tolerance=0.05, success_reward=10.0, max_steps=200)
+    rest = {"tolerance": 0.05, "success_reward": 10.0, "settle": 0.0, "smoothness": 0.0, "max_steps": 200}
+    return Reach(spec, ForwardKinematics(spec), goal_radius, **rest)
 
 
 @pytest.fixture
@@ -64,7 +65,7 @@ def judged(task, distance):
     rows = len(error)
     state = RobotState(np.zeros((rows, 2)), np.zeros((rows, 2)))
     held = 0.02 * (error[:, 0] < task.tolerances[0].value)
-    step = Step(state, np.zeros((rows, 2)), np.zeros((rows, 2)), error, held)
+    step = Step(state, *np.zeros((4, rows, 2)), error, held)
     success = task.success(step)
     return success, task.terminated(step, success), task.rewards(step, success)
 
@@ -273,3 +274,25 @@ def test_a_task_that_the_robot_cannot_do_is_refused(env_config, override, words)
         Simulation(env_config("reacher", override), 1, seed=0)
     for word in words:
         assert word in str(caught.value)
+
+
+def held_for(task, seconds, action=0.0):
+    """A step of a robot that has been at its goal for so long, and changed its action by so much."""
+    state = RobotState(np.zeros((1, 2)), np.zeros((1, 2)))
+    still, changed = np.zeros((1, 2)), np.full((1, 2), action)
+    return Step(state, still, changed, still, still, np.zeros((1, 1)), np.array([seconds]))
+
+
+def test_with_settle_success_is_to_have_stayed(simulate):
+    task = simulate("env.task.settle=0.5", robots=1).task
+    for seconds, success in ((0.02, False), (0.48, False), (0.5, True), (25 * 0.02, True), (1.0, True)):
+        step = held_for(task, seconds)
+        assert task.success(step) == success
+        assert task.terminated(step, task.success(step)) == success
+
+
+def test_smoothness_costs_what_the_action_changes_by(simulate):
+    plain, smooth = (simulate(f"env.task.smoothness={value}", robots=1).task for value in (0.0, 0.3))
+    step = held_for(smooth, 0.0, action=0.5)
+    assert set(plain.rewards(step, np.zeros(1, bool))) == {"distance", "success"}
+    assert smooth.rewards(step, np.zeros(1, bool))["smoothness"] == pytest.approx(-0.15)

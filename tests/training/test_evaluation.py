@@ -1,8 +1,13 @@
+import copy
+
 import pytest
 import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
 
+from physai.envs.make import make
 from physai.training.agent import Agent, make_evaluation_env
-from physai.training.evaluation import Evaluation, evaluate
+from physai.training.evaluation import Evaluation, evaluate, evaluate_in_a_row, wilson
 from tests.training.small import small_config
 
 
@@ -18,8 +23,8 @@ def trained():
 
 
 def result(successes: int, episodes: int) -> Evaluation:
-    success = torch.arange(episodes) < successes
-    return Evaluation(success, torch.full((episodes,), 10), torch.zeros(episodes), torch.zeros(episodes), "m")
+    success, zeros = torch.arange(episodes) < successes, torch.zeros(episodes)
+    return Evaluation(success, success, torch.full((episodes,), 10), zeros, zeros, zeros, zeros, "m")
 
 
 def test_the_interval_is_wilsons():
@@ -30,9 +35,8 @@ def test_the_interval_is_wilsons():
 
 
 def test_steps_to_goal_count_only_goals_that_were_reached():
-    evaluation = Evaluation(
-        torch.tensor([True, False, True]), torch.tensor([10, 200, 30]), torch.zeros(3), torch.zeros(3), "m"
-    )
+    reached = torch.tensor([True, False, True])
+    evaluation = Evaluation(reached, reached, torch.tensor([10, 200, 30]), *torch.zeros(4, 3), "m")
     assert evaluation.summary()["steps_to_goal"] == 20
     assert result(0, 3).summary()["steps_to_goal"] is None
 
@@ -67,3 +71,88 @@ def test_only_the_first_episode_of_a_robot_counts(trained):
     assert (evaluation.length[~evaluation.success] == 200).all()
     assert (evaluation.error[evaluation.success] < 0.05).all()
     assert (evaluation.error[~evaluation.success] >= 0.05).all()
+
+
+class Swing(TensorDictModuleBase):
+    """Takes the arm along Jᵀe to its goal; there it stays, or shakes and turns away after 6 s."""
+
+    def __init__(self, stays: bool) -> None:
+        super().__init__()
+        self.in_keys, self.out_keys = ["features"], ["action"]
+        self.stays = stays
+        self.steps = 0
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        self.steps += 1
+        fine = tensordict["features"][:, -2:]  # tanh of Jᵀe in units of the tolerance
+        if not self.stays:
+            fine = torch.sign(fine) if self.steps < 300 else torch.ones_like(fine)
+        return tensordict.set("action", fine)
+
+
+def swinging(env, stays):
+    return evaluate(Swing(stays), env, 64, seed=3)
+
+
+@pytest.fixture(scope="module")
+def ideal():
+    with_time = make("reacher", 64, overrides=["randomization=none", "env.task.max_steps=400"])
+    yield with_time
+    with_time.close()
+
+
+def test_who_touches_the_goal_and_leaves_it_again_has_success_and_has_not_settled(ideal):
+    stays, leaves = swinging(ideal, stays=True), swinging(ideal, stays=False)
+    assert stays.success_rate > 0.9
+    assert leaves.success_rate > 0.9
+    assert stays.settled_rate > 0.9
+    assert leaves.settled_rate < 0.5
+    low, high = leaves.settled_ci
+    assert low <= leaves.settled_rate <= high
+
+
+def test_watching_on_after_a_success_changes_nothing_of_what_came_before(ideal):
+    # A robot whose episode is over in the sense of the task is judged there: steps, error and return are of its end.
+    leaves = swinging(ideal, stays=False)
+    assert (leaves.length[leaves.success] < 300).all()
+    assert (leaves.error[leaves.success] < 0.05).all()
+
+
+def test_jerky_commands_show_in_the_change_of_action_and_in_the_acceleration(ideal):
+    smooth, jerky = (swinging(ideal, stays).summary() for stays in (True, False))
+    for figure in ("action_change_p99", "acceleration_p99"):
+        assert jerky[figure] > 5 * smooth[figure]
+    assert jerky["action_change_p99"] == pytest.approx(2.0)  # from one end to the other
+
+
+@pytest.mark.slow
+def test_in_a_row_each_robot_begins_where_it_ended_and_every_goal_counts(env_config):
+    config = env_config("reacher")
+    start = config.start.model_copy(update={"carried_over": 1.0})
+    env = make("reacher", 16, overrides=["randomization=none", "env.start.carried_over=1.0"])
+    assert env.simulation.config.start == start
+    moved = []
+    began = env.simulation._begin
+
+    def begin(rows, ended, parameters=None):
+        before = copy.deepcopy(env.simulation.state.joint_position) if env.simulation.started.all() else None
+        began(rows, ended, parameters)
+        if before is not None:
+            moved.append(abs(env.simulation.state.joint_position - before).max())
+
+    env.simulation._begin = begin
+    success = evaluate_in_a_row(Swing(stays=True), env, 5, seed=3)
+    env.close()
+    assert success.shape == (16, 5)
+    assert success.double().mean() > 0.9
+    assert len(moved) >= 5
+    assert max(moved) < 1e-6
+
+
+def test_failures_of_one_robot_widen_the_interval_for_they_depend_on_each_other():
+    spread, one_robot = torch.ones(2, 40, 40, dtype=torch.bool)
+    spread[:, 0] = False
+    one_robot[0] = False
+    assert spread.double().mean() == one_robot.double().mean()
+    narrow, wide = wilson(spread), wilson(one_robot)
+    assert wide[1] - wide[0] > 3 * (narrow[1] - narrow[0])
