@@ -1,14 +1,16 @@
 """``python -m physai.export``: turn the policy of a run into files for robots (see ``--help``)."""
 
+import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from omegaconf import DictConfig
 
 from physai import cli
 from physai.config import Config, PackageName, validate
 from physai.errors import UserError
+from physai.files import write_atomically
 
 if TYPE_CHECKING:
     from physai.training.config import TrainConfig
@@ -70,7 +72,9 @@ def export(run_dir: Path, which: str, formats: Sequence[str], config: "TrainConf
     def report(stage: str, result: str) -> None:
         print(f"  {stage:<38} {result}", flush=True)
 
-    export_policy(run_dir, which, formats, report, config=config)
+    metadata = export_policy(run_dir, which, formats, report, config=config)
+    if which == "best":
+        _note(run_dir, metadata.raw["evaluation"]["transfer"])
     written = [FILES[name] for name in formats]
     print(
         f"Written to {run_dir}: {', '.join(written)}{', policy.pt.sha256' if FILES['torchscript'] in written else ''}"
@@ -78,6 +82,18 @@ def export(run_dir: Path, which: str, formats: Sequence[str], config: "TrainConf
     for other in set(FILES.values()) - set(written):
         if (run_dir / other).exists():
             print(f"{other} is from an earlier export, perhaps of another checkpoint")
+
+
+def _note(run_dir: Path, transfer: dict[str, Any] | None) -> None:
+    """Add to the summary of a run how its best policy drives in the other engine."""
+    path = run_dir / "summary.json"
+    if transfer is None or not path.is_file():
+        return
+    try:
+        summary = dict(json.loads(path.read_text()))
+    except (ValueError, TypeError, RecursionError) as error:
+        raise UserError(f"{path}: the run's summary is damaged") from error
+    write_atomically(path, json.dumps(summary | {"transfer": transfer}, indent=2).encode())
 
 
 if __name__ == "__main__":

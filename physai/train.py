@@ -55,13 +55,16 @@ class Training:
     def check(self, node: DictConfig) -> None:
         """Build the parts; raises a UserError if one cannot be built."""
         from physai.artifact.module import make_deployable, script
+        from physai.artifact.transfer import other_engine
         from physai.training.agent import Agent
 
         self.close()
         config = _config(node)
         self._agent = Agent.build(config)
-        if config.export:
+        if config.export.formats:
             script(make_deployable(self._agent.policy(), self._agent.env))  # what does not script cannot be exported
+            if config.export.transfer == "require":
+                other_engine(config.env.physics)
         if not self._keep:
             self.close()
 
@@ -158,8 +161,8 @@ def _export(config: "TrainConfig", run_dir: Path, complete: bool) -> None:
     from physai.artifact import FILES, onnx
     from physai.export import export
 
-    lacking = onnx.missing() if "onnx" in config.export else []
-    formats = [name for name in config.export if not (name == "onnx" and lacking)]
+    lacking = onnx.missing() if "onnx" in config.export.formats else []
+    formats = [name for name in config.export.formats if not (name == "onnx" and lacking)]
     files = [FILES[name] for name in formats]
     if "torchscript" in formats:
         files.append(f"{FILES['torchscript']}.sha256")

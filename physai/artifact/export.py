@@ -8,13 +8,14 @@ from pathlib import Path
 
 import torch
 
-from physai.artifact import describe, gate, onnx
-from physai.artifact.module import make_deployable, save, script
+from physai.artifact import describe, gate, onnx, transfer
+from physai.artifact.module import DeployablePolicy, make_deployable, save, script
 from physai.artifact.states import States, extreme_states, roll_out
 from physai.deploy import Metadata, PolicyError, load_policy
 from physai.deploy.archive import content_sha256
 from physai.deploy.metadata import metadata_sha256
 from physai.deploy.policy import load_module
+from physai.errors import UserError
 from physai.files import write_atomically
 from physai.seeding import derive
 from physai.training.config import TrainConfig
@@ -22,6 +23,7 @@ from physai.training.run import TrainedPolicy, git_commit
 
 FILES = {"torchscript": "policy.pt", "onnx": "policy.onnx"}
 EPISODES = 200  # that the artifact drives before it is written
+TRANSFER_EPISODES = 1000  # in the other engine
 GOLDEN_PAIRS = 32
 SEED = derive(0, "export")
 _ROBOTS = 200
@@ -49,7 +51,8 @@ def export_policy(
         What the files say about themselves.
 
     Raises:
-        GateError: If any two forms of the policy disagree; nothing is written.
+        GateError: If any two forms of the policy disagree, or it fails in the other engine and the run requires that it
+            does not; nothing is written.
         UserError: If there is no such policy, or it cannot be exported.
     """
     trained = TrainedPolicy(run_dir, which, config=config)
@@ -92,11 +95,20 @@ def export_policy(
         driven = gate.check_drive(content, policy, actor, env, episodes, SEED)
         report(f"drives {episodes:,} episodes", f"reaches {driven.success_rate:.1%} of the goals, as the policy does")
 
+        opinion = _second_opinion(content, policy, trained, report)
+        if opinion is not None and trained.config.export.transfer == "require":
+            opinion.require(driven)
+
         described = {
             **describe.describe_origin(git_commit()),
             **describe.describe_robot(env.simulation, policy),
             "checkpoint": {"which": which, "frames": trained.frames},
-            "evaluation": {**driven.summary(), "episodes": episodes, "randomization": trained.randomization.name},
+            "evaluation": {
+                **driven.summary(),
+                "episodes": episodes,
+                "randomization": trained.randomization.name,
+                "transfer": opinion and opinion.summary(),
+            },
             "config": trained.config.model_dump(mode="json"),
             "golden": describe.golden_pairs(states, expected, GOLDEN_PAIRS),
             "content_sha256": content_sha256(content),
@@ -117,6 +129,26 @@ def export_policy(
         return metadata
     finally:
         env.close()
+
+
+def _second_opinion(
+    content: bytes, policy: DeployablePolicy, trained: TrainedPolicy, report: Callable[[str, str], None]
+) -> transfer.Opinion | None:
+    """Ask the other engine; None where it cannot be asked and need not be."""
+    try:
+        physics = transfer.other_engine(trained.config.env.physics)
+        opinion = transfer.ask(content, policy, trained, physics, TRANSFER_EPISODES, SEED)
+    except UserError as error:
+        if trained.config.export.transfer == "require":
+            raise gate.GateError(f"export.transfer=require: {error}") from error
+        report("drives in the other engine", f"not asked: {error}")
+        return None
+    there = opinion.evaluation
+    name = f"drives in {physics['_target_'].rpartition('.')[2].removesuffix('Physics')}"
+    report(name, f"reaches {there.success_rate:.1%} of {opinion.episodes:,} goals, stays at {there.settled_rate:.1%}")
+    for difference in opinion.differences:
+        report("", difference)
+    return opinion
 
 
 def _load_as_a_robot_would(content: bytes) -> Metadata:

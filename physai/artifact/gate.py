@@ -324,7 +324,7 @@ def check_drive(
     Raises:
         GateError: If its success rate is not that of the actor on the same goals.
     """
-    driven = evaluate(_Driver(content, policy, env.simulation.joint_command), env, episodes, seed)
+    driven = evaluate(FileDriver(content, policy, env.simulation.joint_command), env, episodes, seed)
     trained = evaluate(actor, env, episodes, seed)
     if abs(driven.success_rate - trained.success_rate) > SUCCESS_TOLERANCE:
         raise GateError(
@@ -334,7 +334,7 @@ def check_drive(
     return driven
 
 
-class _Driver(TensorDictModuleBase):
+class FileDriver(TensorDictModuleBase):
     """A policy file in the place of the actor: sees only what a robot senses, and what it remembers."""
 
     def __init__(self, content: bytes, policy: DeployablePolicy, joint_command: JointCommand) -> None:
@@ -345,6 +345,7 @@ class _Driver(TensorDictModuleBase):
         self.joint_command = joint_command
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write ``action``, and what is remembered."""
         command, *memory = as_tuple(self.module(*(tensordict.get(key) for key in self.in_keys)))
         last_command = tensordict.get(LAST_COMMAND, command)
         action = self.joint_command.action(command, last_command)

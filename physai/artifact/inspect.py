@@ -58,6 +58,7 @@ def _summary(path: Path, metadata: Metadata) -> Table:
         "evaluation": f"on {evaluation['episodes']:,} goals, randomization {evaluation['randomization']}",
         "success": rate(evaluation, "success"),
         "settled": rate(evaluation, "settled"),
+        **_transfer(evaluation["transfer"]),
         "checkpoint": f"{raw['checkpoint']['which']}, {raw['checkpoint']['frames']:,} frames",
         "golden pairs": str(len(metadata.golden[metadata.goal.name])),
         "versions": ", ".join(f"{name} {version}" for name, version in raw["versions"].items()),
@@ -71,6 +72,13 @@ def _summary(path: Path, metadata: Metadata) -> Table:
     for key, value in rows.items():
         table.add_row(key, escape(value))
     return table
+
+
+def _transfer(transfer: dict[str, Any] | None) -> dict[str, str]:
+    if transfer is None:
+        return {}
+    engine = transfer["physics"]["_target_"].rpartition(".")[2].removesuffix("Physics")
+    return {f"{what} in {engine}": rate(transfer, what) for what in ("success", "settled")}
 
 
 def _joints(metadata: Metadata) -> Table:

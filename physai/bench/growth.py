@@ -52,7 +52,7 @@ def _run(frames: int, robots: int, seed: int) -> Run:
             *(sys.executable, "-m", "physai.train", "env=reacher", f"seed={seed}", f"hydra.run.dir={folder}"),
             *(f"total_frames={frames}", f"collector.num_envs={robots}"),
             "evaluation.episodes=100",  # the thousand robots of the final evaluation would hide the others
-            "export=[]",  # whose memory is the same for all
+            "export.formats=[]",  # whose memory is the same for all
         ]
         megabytes = 0.0
         with open(Path(folder) / "said.txt", "w+") as said:

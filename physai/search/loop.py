@@ -33,7 +33,7 @@ def run_trials(
         while True:
             while len(running) < min(settings.jobs, settings.trials - study.done()):
                 run, trial = study.ask()
-                values = ["export=[]", *fixed, *overrides(trial.params)]  # of many trials, few are for a robot
+                values = ["export.formats=[]", *fixed, *overrides(trial.params)]  # of many trials, few are for a robot
                 running.append(_Running(run, trial, folder / str(run), values, config))
             if not running:
                 return

@@ -29,6 +29,13 @@ class EvaluationConfig(Config):
     randomization: RandomizationConfig
 
 
+class ExportConfig(Config):
+    """What the best policy becomes, and whether it must succeed in another engine."""
+
+    formats: list[Literal["torchscript", "onnx"]]
+    transfer: Literal["report", "require"]
+
+
 class PolicyConfig(Config):
     """One file of ``conf/policy``."""
 
@@ -53,11 +60,11 @@ class TrainConfig(Config):
     normalization: NormalizationConfig
     checkpoint: CheckpointConfig
     evaluation: EvaluationConfig
+    export: ExportConfig
     logger: Target
     seed: Seed
     total_frames: Count
     device: Annotated[str, Field(pattern=r"^(cpu|cuda(:\d+)?)$")]
     threads: Count
-    export: list[Literal["torchscript", "onnx"]]
     resume: None  # the command takes it before a config is made
     allow: list[PackageName]  # for resume: what a new run names is the user's own

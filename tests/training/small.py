@@ -28,7 +28,7 @@ SMALL = (
     "collector.num_envs=16",
     "collector.frames_per_batch=1024",
     "algo.minibatch_size=256",
-    "export=[]",  # which takes three times as long as all the rest
+    "export.formats=[]",  # which takes three times as long as all the rest
 )
 
 # Runs of two iterations, episodes of 20 steps: for tests of what starts them.
@@ -43,9 +43,9 @@ TINY = (
     "collector.num_envs=16",
     "collector.frames_per_batch=512",
     "algo.minibatch_size=128",
-    "export=[]",
+    "export.formats=[]",
 )
-EXPORTED = "export=[torchscript,onnx]"  # as by default
+EXPORTED = "export.formats=[torchscript,onnx]"  # as by default
 
 
 def small_config(*overrides: str) -> TrainConfig:

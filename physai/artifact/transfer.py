@@ -1,0 +1,187 @@
+"""A second opinion: how a policy file drives in an engine that it was not trained in."""
+
+import importlib.util
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from physai.artifact.gate import FileDriver, GateError
+from physai.artifact.module import DeployablePolicy
+from physai.compose import compose
+from physai.config import not_installed
+from physai.envs.simulation import EnvConfig, Simulation
+from physai.errors import UserError
+from physai.training.evaluation import MAX_ROBOTS, Evaluation, evaluate
+from physai.training.run import TrainedPolicy
+
+LOWEST = 0.97  # success rate in the other engine that a policy must have for certain (lower bound of 95 %)
+LARGEST_DROP = 0.01  # of the success rate, from the engine of the training to the other
+_SPEED, _STEPS = 0.5, 25  # of the largest command, and for how long each joint is moved
+_LATE = 2  # control steps; a drive's time constant takes one
+_SCALES = 0.5 ** np.arange(16)  # of the effort limit
+
+
+def other_engine(physics: dict[str, Any]) -> dict[str, Any]:
+    """Return the engine of ``conf/physics`` that a policy has not been trained in, with the motors of a drive.
+
+    Raises:
+        UserError: If it is not installed.
+    """
+    in_mujoco = physics["_target_"].rpartition(".")[2] == "MuJoCoPhysics"
+    chosen = ["physics=pybullet"] if in_mujoco else ["physics=mujoco", "physics.motor=servo"]
+    module = "pybullet" if in_mujoco else "mujoco"
+    if importlib.util.find_spec(module) is None:
+        raise UserError(f"the other engine needs {not_installed(module)}")
+    return dict(compose("train", chosen).physics)
+
+
+@dataclass(frozen=True)
+class Opinion:
+    """What came of asking another engine.
+
+    Attributes:
+        physics: The engine, as ``conf/physics`` names one.
+        evaluation: Of the policy there.
+        differences: What an arm does otherwise there, a line each.
+        episodes: How many goals there were.
+        randomization: Name of how robots differed.
+    """
+
+    physics: dict[str, Any]
+    evaluation: Evaluation
+    differences: list[str]
+    episodes: int
+    randomization: str
+
+    def summary(self) -> dict[str, Any]:
+        """The figures, for the files."""
+        return {
+            "physics": self.physics,
+            **self.evaluation.summary(),
+            "episodes": self.episodes,
+            "randomization": self.randomization,
+            "differences": self.differences,
+        }
+
+    def require(self, own: Evaluation) -> None:
+        """See that the policy is as good there as in its ``own`` engine.
+
+        Raises:
+            GateError: If it is not, or arms differ; it says how.
+        """
+        low, there = self.evaluation.success_ci[0], self.evaluation.success_rate
+        said = f"the policy reaches {there:.1%} of {self.episodes:,} goals in the other engine"
+        if self.differences:
+            raise GateError(f"{'; '.join(self.differences)} in the other engine ({said})")
+        if low < LOWEST:
+            raise GateError(f"{said}, for certain {low:.1%}; {LOWEST:.0%} are required")
+        if own.success_rate - there > LARGEST_DROP:
+            raise GateError(f"{said}, and {own.success_rate:.1%} in its own; at most {LARGEST_DROP:.0%} may be lost")
+
+
+def ask(
+    content: bytes, policy: DeployablePolicy, trained: TrainedPolicy, physics: dict[str, Any], episodes: int, seed: int
+) -> Opinion:
+    """Let a TorchScript file drive the robots of its run in another engine.
+
+    Args:
+        content: The file.
+        policy: What it was made from.
+        trained: The policy of the run.
+        physics: The engine.
+        episodes: How many goals.
+        seed: Seeds them.
+
+    Raises:
+        UserError: If the engine cannot load the robot.
+    """
+    config = trained.config.env
+    found = differences(config, physics)
+    _, env = trained.deploy(min(episodes, MAX_ROBOTS), seed, config.model_copy(update={"physics": physics}))
+    try:
+        driven = evaluate(FileDriver(content, policy, env.simulation.joint_command), env, episodes, seed)
+    finally:
+        env.close()
+    return Opinion(physics, driven, found, episodes, trained.randomization.name)
+
+
+@dataclass(frozen=True)
+class _Response:
+    """What n joints do when one of them is told to move, relative to what they do when none is.
+
+    Attributes:
+        moved: [joint told, joint moving], rad, at the end.
+        onset: Control steps until the joint that moves most does so, [n].
+        weak: How far the told joint gets with its effort limit scaled, rad, [scales, n].
+    """
+
+    moved: np.ndarray
+    onset: np.ndarray
+    weak: np.ndarray
+
+
+def differences(config: EnvConfig, other: dict[str, Any]) -> list[str]:
+    """Move each joint alone in two engines, and say what an arm in the other one does differently.
+
+    What is looked for: joints that turn the other way or in another order, commands that arrive later, motors with
+    less or more effort than the same limit allows. How fast a drive closes in on its command is no difference.
+
+    Args:
+        config: Robot and engine of the training.
+        other: The other engine, as ``config.physics`` names one.
+
+    Returns:
+        One line a difference.
+    """
+    expected, found = (_respond(config.model_copy(update={"physics": physics})) for physics in (config.physics, other))
+    joints, lines = config.robot.joints, []
+    moves = np.abs(found.moved).argmax(axis=1)
+    for told, joint in enumerate(joints):
+        if moves[told] != told:
+            lines.append(f"a command for {joint} moves {joints[moves[told]]}")
+        elif found.moved[told, told] * expected.moved[told, told] < 0:
+            lines.append(f"{joint} turns the other way")
+    if lines:
+        return lines
+    late = int(np.median(found.onset - expected.onset))
+    if abs(late) >= _LATE:
+        lines.append(f"commands arrive {abs(late)} control steps {'later' if late > 0 else 'earlier'}")
+    full = np.abs(expected.moved.diagonal())
+    for number, joint in enumerate(joints):
+        scale = int(np.abs(expected.weak[:, number] / full[number] - 0.5).argmin())  # where the limit is what decides
+        share = float(found.weak[scale, number] / expected.weak[scale, number])
+        if not 0.7 < share < 1.4:
+            less = "less" if share < 1 else "more"
+            lines.append(
+                f"the motor of {joint} has {less} effort: with the same limit it gets {share:.2f} times as far"
+            )
+    return lines
+
+
+def _respond(config: EnvConfig) -> _Response:
+    """Rows of the simulation: each joint in turn at each scale of its effort limit; once told to move, once not."""
+    joints = len(config.robot.joints)
+    rows = joints * len(_SCALES)
+    at_home = config.start.model_copy(update={"spread": [0.0] * joints, "carried_over": 0.0})
+    simulation = Simulation(config.model_copy(update={"start": at_home}), 2 * rows, seed=0)
+    try:
+        told = np.tile(np.repeat(np.arange(joints), len(_SCALES)), 2)
+        parameters = simulation.physics_parameters.copy()
+        effort = simulation.layout.columns["effort_limit"].start + told
+        parameters[np.arange(2 * rows), effort] *= np.tile(_SCALES, 2 * joints)
+        simulation.reset(parameters=parameters)
+        action = np.zeros((2 * rows, joints), np.float32)
+        action[np.arange(rows), told[:rows]] = _SPEED
+        path = []
+        for _ in range(_STEPS):
+            simulation.step(action)
+            path.append(simulation.state.joint_position[:rows] - simulation.state.joint_position[rows:])
+    finally:
+        simulation.close()
+    path_of = np.stack(path).reshape(_STEPS, joints, len(_SCALES), joints)  # [step, told, scale, moving]
+    strong, of_told = path_of[:, :, 0], path_of[:, np.arange(joints), :, np.arange(joints)]  # [told, step, scale]
+    most = np.abs(strong[-1]).argmax(axis=1)
+    alone = np.abs(strong[:, np.arange(joints), most])  # [step, told]
+    step = _SPEED * simulation.spec.command_limit * config.control_dt
+    return _Response(strong[-1], (alone > 0.2 * step).argmax(axis=0), np.abs(of_told[:, -1]).T)

@@ -1,0 +1,131 @@
+"""The gate asks a second engine."""
+
+import json
+import shutil
+
+import pytest
+import torch
+
+from physai.artifact import export as module
+from physai.artifact import export_policy, gate, transfer
+from physai.errors import UserError
+from physai.training.evaluation import Evaluation
+from physai.training.run import load_config
+from tests.training.small import command
+
+ENVS = {
+    "planar arm": ("reacher",),
+    "planar arm by positions": ("reacher", "env.robot.command=joint_position"),
+    "KUKA": ("kuka_reacher",),
+}
+
+
+def planted(name):
+    physics = transfer.other_engine({"_target_": "physai.physics.pybullet.PyBulletPhysics"})
+    return physics | {"_target_": f"tests.artifact.planted.{name}"}
+
+
+@pytest.mark.parametrize("env", ENVS)
+@pytest.mark.parametrize("engine", ["PyBullet", "MuJoCo"])
+def test_the_engines_move_each_joint_alike(env_config, env, engine):
+    physics = ["physics=mujoco", "physics.motor=impulse"] if engine == "MuJoCo" else []
+    config = env_config(*ENVS[env], *physics)
+    other = transfer.other_engine(config.physics)
+    assert other["_target_"] != config.physics["_target_"]
+    assert transfer.differences(config, other) == []
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("Flipped", "{last} turns the other way"),
+        ("Swapped", "a command for {first} moves {second}"),
+        ("Late", "commands arrive 3 control steps later"),
+        ("Weak", "the motor of {last} has less effort: with the same limit it gets 0."),
+    ],
+)
+@pytest.mark.parametrize("env", ["planar arm", "KUKA"])
+def test_what_is_planted_in_the_other_engine_is_named(env_config, env, name, said):
+    config = env_config(*ENVS[env])
+    first, second = config.robot.joints
+    found = transfer.differences(config, planted(name))
+    wanted = said.format(first=first, second=second, last=second)
+    assert any(line.startswith(wanted) for line in found), found
+
+
+@pytest.fixture
+def required(exported_run, tmp_path):
+    """A copy of a run without its policy files, and its config, which requires that the other engine agrees."""
+    run = tmp_path / "run"
+    shutil.copytree(exported_run, run, ignore=shutil.ignore_patterns("policy.*"))
+    config = load_config(run)
+    return run, config.model_copy(update={"export": config.export.model_copy(update={"transfer": "require"})})
+
+
+@pytest.mark.slow
+def test_a_run_that_requires_transfer_gets_no_file_where_arms_differ(required, monkeypatch):
+    run, config = required
+    physics = planted("Weak")  # which this policy does not even notice
+    monkeypatch.setattr(transfer, "other_engine", lambda _: physics)
+    monkeypatch.setattr(module, "TRANSFER_EPISODES", 50)
+    with pytest.raises(gate.GateError, match="the motor of joint1 has less effort"):
+        export_policy(run, "best", ["torchscript"], config=config)
+    assert not list(run.glob("policy.*"))
+
+
+def evaluation(rate, episodes=1000):
+    success, zeros = torch.arange(episodes) < rate * episodes, torch.zeros(episodes)
+    return Evaluation(success, success, zeros, zeros, zeros, zeros, zeros, "m")
+
+
+@pytest.mark.parametrize(
+    ("own", "other", "said"),
+    [
+        (0.99, 0.985, None),
+        (0.96, 0.96, "reaches 96.0% of 1,000 goals in the other engine, for certain 94.6%; 97% are required"),
+        (1.0, 0.985, "reaches 98.5% of 1,000 goals in the other engine, and 100.0% in its own; at most 1% may be lost"),
+    ],
+)
+def test_a_low_rate_or_a_drop_is_refused(own, other, said):
+    opinion = transfer.Opinion({"_target_": "x.Physics"}, evaluation(other), [], 1000, "default")
+    if said is None:
+        opinion.require(evaluation(own))
+    else:
+        with pytest.raises(gate.GateError, match=said):
+            opinion.require(evaluation(own))
+
+
+@pytest.mark.slow
+def test_files_and_summary_say_how_the_policy_drives_in_the_other_engine(required):
+    run, _ = required
+    export = command("export", f"run={run}", "format=torchscript", cwd=run)
+    output = export.communicate()[0]
+    assert export.returncode == 0, output
+    assert "drives in MuJoCo" in output
+    files = {"metadata.json": ""}
+    torch.jit.load(run / "policy.pt", _extra_files=files)
+    said = json.loads(files["metadata.json"])["evaluation"]["transfer"]
+    assert said["physics"]["_target_"] == "physai.physics.mujoco.MuJoCoPhysics"
+    assert said["physics"]["motor"] == "servo"
+    assert said["episodes"] == 1000
+    assert said["differences"] == []
+    for name in ("success", "settled"):
+        low, high = said[f"{name}_ci"]
+        assert low <= said[f"{name}_rate"] <= high
+    summary = json.loads((run / "summary.json").read_text())
+    assert summary["transfer"] == said
+    assert summary["frames"] > 100_000
+
+
+def test_without_the_other_engine_a_run_that_requires_it_stops_and_others_are_told(required, monkeypatch):
+    run, config = required
+    monkeypatch.setattr(transfer.importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(UserError, match=r"the other engine needs 'mujoco', .*: pip install 'physai\[mujoco\]'"):
+        transfer.other_engine(config.env.physics)
+    with pytest.raises(gate.GateError, match=r"export\.transfer=require: the other engine needs 'mujoco'"):
+        export_policy(run, "best", ["torchscript"], config=config)
+    assert not list(run.glob("policy.*"))
+    told = {}
+    export_policy(run, "best", ["torchscript"], told.__setitem__, config=load_config(run))
+    assert told["drives in the other engine"].startswith("not asked: the other engine needs 'mujoco'")
+    assert (run / "policy.pt").is_file()
