@@ -77,6 +77,7 @@ class Simulation:
         state: What the robots truly do.
         goal: [N, g].
         error: How far they are from it, one column a tolerance, [N, e].
+        tolerance: Within which they count as there, [e]; the task's, unless somebody asks for more.
         success: Whether the last step was one, [N, 1].
         last_action: What was asked of them last, [N, n], in [-1, 1]; zeros when an episode begins.
         last_command: What the robots were told last, [N, n], rad/s or rad; where they stand when an episode begins.
@@ -104,7 +105,7 @@ class Simulation:
         self.physics: Physics = make("env.physics", config.physics, self.spec, *sizes, needs=_PHYSICS)
         self.generator = torch.Generator()
         self.seed(seed)
-        self._tolerance = np.array([tolerance.value for tolerance in self.task.tolerances])
+        self.tolerance = np.array([tolerance.value for tolerance in self.task.tolerances])
         self._delay = ActuatorDelay(num_envs, len(self.spec.joints))
         self.state: RobotState = self.physics.robot_state()
         self.goal: np.ndarray = np.zeros((num_envs, *self.task.goal.shape))
@@ -203,7 +204,7 @@ class Simulation:
         else:
             rows = None
         self.error = self.task.error(self.state, self.goal)
-        near = (self.error < self._tolerance).all(axis=1)
+        near = (self.error < self.tolerance).all(axis=1)
         self.within = np.where(near, self.within + 1, 0)
         step = self._step(command, action)
         self.last_action = action

@@ -20,7 +20,7 @@ EVALUATION_SEED = derive(0, "evaluation goals while training")  # the same goals
 
 
 class EvaluationCallback(Callback):
-    """Evaluates the policy on the same goals every time, and keeps the best: by success rate, then by return.
+    """Evaluates the policy on the same goals every time, and keeps the best: by success, then settled, then return.
 
     Its robots are made for the first evaluation: frames need not wait for them.
 
@@ -36,7 +36,7 @@ class EvaluationCallback(Callback):
     def __init__(self, config: TrainConfig) -> None:
         self._config = config
         self._env: TransformedRobotEnv | None = None
-        self._best = [-1.0, 0.0]
+        self._best = [-1.0, 0.0, 0.0]
         self.best_frames = 0
 
     def after_batch(self, trainer: Trainer, batch: TensorDictBase, values: dict[str, float]) -> None:
@@ -45,7 +45,7 @@ class EvaluationCallback(Callback):
             return
         with trainer.untimed():
             result = self._evaluate(trainer)
-            score = [result.success_rate, float(result.episode_return.mean())]
+            score = [result.success_rate, result.settled_rate, float(result.episode_return.mean())]
             if score >= self._best or not trainer.folder.best.is_file():
                 self._best, self.best_frames = score, trainer.clock.frames
                 content = {"frames": trainer.clock.frames, **trainer.agent.policy_state()}

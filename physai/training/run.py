@@ -176,11 +176,15 @@ class TrainedPolicy:
             raise UserError(f"{run_dir}: the checkpoint '{which}' does not say how many frames it has learned from")
 
     def deploy(
-        self, num_envs: int, seed: int, env_config: EnvConfig | None = None
+        self,
+        num_envs: int,
+        seed: int,
+        env_config: EnvConfig | None = None,
+        randomization: RandomizationConfig | None = None,
     ) -> tuple[TensorDictModuleBase, TransformedRobotEnv]:
         """Build the actor, and an env with the statistics that it was trained with; the run's, if no other is given."""
         config = self.config if env_config is None else self.config.model_copy(update={"env": env_config})
-        env = make_evaluation_env(config, self.randomization, num_envs, seed)
+        env = make_evaluation_env(config, randomization or self.randomization, num_envs, seed)
         try:
             actor = make_actor(config, env)
             load_policy_state(actor, env, self._state)

@@ -23,6 +23,7 @@ from physai.ros.demo import DemoConfig
 from physai.ros.topics.commands import controller_topic
 from physai.search.config import SearchConfig
 from physai.signals import Quantity
+from physai.stress.__main__ import StressConfig
 from physai.training.config import TrainConfig
 from tests.docs.blocks import ROOT, hooks
 
@@ -32,6 +33,7 @@ SOURCES = "\n".join(path.read_text() for path in sorted((ROOT / "physai").rglob(
 COMMANDS = {
     "physai.train": ("train", TrainConfig),
     "physai.search": ("search", SearchConfig),
+    "physai.stress": ("stress", StressConfig),
     "physai.evaluate": ("evaluate", EvaluateConfig),
     "physai.export": ("export", ExportConfig),
     "physai.play": ("play", PlayConfig),

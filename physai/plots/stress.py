@@ -1,0 +1,75 @@
+"""Pictures of stress tests: success over two parameters."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import matplotlib
+import numpy as np
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+
+if TYPE_CHECKING:
+    from physai.stress.run import Map
+
+_UNITS = {
+    "payload": "kg",
+    "actuator_delay": "control steps",
+    "encoder_offset": "rad",
+    "position_noise": "rad",
+    "velocity_noise": "rad/s",
+    "motor_time_constant": "s",
+}
+_WORKS = 95  # %
+
+
+def plot_maps(maps: "Mapping[str, Map]", output: Path) -> None:
+    """Draw success (left) and settled (right) over two parameters, a row for each run, all on one scale.
+
+    A line surrounds what works for 95 % of the goals, a dashed box what the policy was trained on.
+
+    Args:
+        maps: By the name of the run.
+        output: The PNG to write.
+    """
+    figure, axes = plt.subplots(
+        len(maps), 2, figsize=(11, 0.6 + 4.2 * len(maps)), layout="constrained", squeeze=False, sharex=True, sharey=True
+    )
+    for row, (run, found) in zip(axes, maps.items(), strict=True):
+        for axis, what in zip(row, ("success", "settled"), strict=True):
+            mesh = _heat(axis, found, 100 * getattr(found, what) / found.episodes)
+            axis.set_title(f"{Path(run).name}: {what}" if len(maps) > 1 else what.capitalize())
+        row[0].set_ylabel(_label(found.y.name, found.y.operation))
+    for axis in axes[-1]:
+        axis.set_xlabel(_label(found.x.name, found.x.operation))
+    figure.colorbar(mesh, ax=axes, label="% of goals", shrink=0.9)
+    lines = {"95 % work": ("black", "-"), "range of the training": ("crimson", "--")}
+    handles = [plt.Line2D([], [], color=color, linestyle=style, linewidth=2) for color, style in lines.values()]
+    figure.legend(handles, list(lines), loc="outside lower center", ncols=2, frameon=False)
+    figure.savefig(output, dpi=130)
+    plt.close(figure)
+
+
+def _heat(axis: plt.Axes, found: "Map", percent: np.ndarray) -> matplotlib.collections.QuadMesh:
+    columns, rows = np.arange(len(found.x_values)), np.arange(len(found.y_values))
+    mesh = axis.pcolormesh(columns, rows, percent, cmap="viridis", vmin=0, vmax=100)
+    for (row, column), value in np.ndenumerate(percent):
+        color = "black" if value > 60 else "white"
+        axis.text(column, row, f"{value:.0f}", ha="center", va="center", fontsize=7, color=color)
+    if percent.min() < _WORKS <= percent.max():
+        axis.contour(columns, rows, percent, levels=[_WORKS], colors="black", linewidths=2)
+    (left, right), (bottom, top) = (
+        np.interp(trained, values, np.arange(len(values)))
+        for trained, values in zip(found.trained, (found.x_values, found.y_values), strict=True)
+    )
+    size = right - left, top - bottom
+    axis.add_patch(plt.Rectangle((left, bottom), *size, fill=False, edgecolor="crimson", linewidth=2, linestyle="--"))
+    axis.set_xticks(columns, [f"{value:.3g}" for value in found.x_values])
+    axis.set_yticks(rows, [f"{value:.3g}" for value in found.y_values])
+    return mesh
+
+
+def _label(name: str, operation: str) -> str:
+    unit = "times what the robot's description says" if operation == "scale" else _UNITS.get(name, "")
+    return f"{name.replace('_', ' ')}, {unit}".rstrip(", ")

@@ -1,0 +1,1 @@
+"""Where a policy stops to work: maps over two parameters, and the break values of each alone."""

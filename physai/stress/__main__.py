@@ -1,0 +1,156 @@
+"""``python -m physai.stress``: find out where a policy stops to work (see ``--help``)."""
+
+import json
+import sys
+from pathlib import Path
+from typing import Annotated, Any
+
+from omegaconf import DictConfig
+from pydantic import Field
+from rich.console import Console
+from rich.progress import Progress
+from rich.table import Table
+
+from physai import cli
+from physai.config import Config, Count, PackageName, Seed, validate
+from physai.errors import UserError
+from physai.evaluate import PolicyChoice
+from physai.files import write_atomically
+from physai.stress.axes import Axis, AxisConfig
+from physai.stress.run import Map, StressTest
+from physai.training.run import TrainedPolicy
+
+Breaks = dict[str, dict[str, list[float | None]]]
+"""By axis, for ``success`` and ``settled``: the last values that work, towards the low and the high end."""
+
+
+class StressConfig(Config):
+    """``conf/stress.yaml``."""
+
+    run: str | Annotated[list[str], Field(min_length=1)]
+    x: str
+    y: str
+    grid: Annotated[Count, Field(ge=2)]
+    episodes: Count
+    breaks: bool
+    output: str | None
+    allow: list[PackageName]
+    env: dict[str, Any] | None
+    physics: dict[str, Any] | None
+    randomization: dict[str, Any] | None
+    checkpoint: str | int
+    seed: Seed
+    axes: dict[str, AxisConfig]
+
+    @property
+    def runs(self) -> list[str]:
+        """The run folders."""
+        return [self.run] if isinstance(self.run, str) else self.run
+
+    def load(self, run: str) -> TrainedPolicy:
+        """The policy of one of them."""
+        same = {name: getattr(self, name) for name in PolicyChoice.model_fields if name != "run"}
+        return PolicyChoice(run=run, **same).load()
+
+    def axis(self, name: str, policy: TrainedPolicy) -> Axis:
+        """An axis, for the robots of a policy."""
+        return Axis.make(name, self.axes, policy.config.env)
+
+    def others(self, policy: TrainedPolicy) -> list[Axis]:
+        """All axes that the robots of a policy have."""
+        found = []
+        for name in self.axes:
+            try:
+                found.append(self.axis(name, policy))
+            except UserError:
+                if name in (self.x, self.y):
+                    raise
+        return found
+
+
+def _check(node: DictConfig) -> None:
+    config = validate(StressConfig, node)
+    if config.x == config.y:
+        raise UserError(f"x and y are both '{config.x}'")
+    if config.output is not None and Path(config.output).suffix != ".png":
+        raise UserError(f"output: '{config.output}' must end in .png")
+    for run in config.runs:
+        policy = config.load(run)
+        if not policy.config.env.simulated:
+            raise UserError(f"env '{policy.config.env.name}': only simulated robots can be given other parameters")
+        for name in (config.x, config.y):
+            config.axis(name, policy)
+
+
+def _stress(node: DictConfig, _: Path) -> None:
+    from physai.plots.stress import plot_maps
+
+    config = validate(StressConfig, node)
+    maps: dict[str, Map] = {}
+    name = f"stress_{config.x}_{config.y}"
+    for run in config.runs:
+        policy = config.load(run)
+        found, breaks = _try(config, policy, run)
+        maps[run] = found
+        summary = {
+            "run": run,
+            "checkpoint": config.checkpoint,
+            "env": policy.config.env.name,
+            "physics": policy.config.env.physics,
+            "randomization": policy.randomization.name,
+            "seed": config.seed,
+            **found.summary(),
+            "breaks": breaks,
+        }
+        path = Path(run) / f"{name}.json"
+        write_atomically(path, json.dumps(summary, indent=2).encode())
+        if breaks:
+            _show(run, breaks, config, policy)
+    output = Path(config.output or (Path(config.runs[0]) if len(maps) == 1 else Path()) / f"{name}.png")
+    plot_maps(maps, output)
+    print(f"Map: {output}; figures: {', '.join(str(Path(run) / name) + '.json' for run in maps)}")
+
+
+def _try(config: StressConfig, policy: TrainedPolicy, run: str) -> tuple[Map, Breaks]:
+    x, y = (config.axis(name, policy) for name in (config.x, config.y))
+    breaks: Breaks = {}
+    bar = Progress(disable=not sys.stdout.isatty())
+    with StressTest(policy, config.episodes, config.seed) as test, bar:
+        task = bar.add_task(f"{run}: map", total=len(x.values(config.grid)) * len(y.values(config.grid)))
+        result = test.map(x, y, config.grid, lambda: bar.advance(task))
+        if config.breaks:
+            axes = config.others(policy)
+            task = bar.add_task(f"{run}: break values", total=2 * len(axes))
+            for axis, end, found in test.breaks(axes):
+                for what, value in found.items():
+                    breaks.setdefault(axis.name, {}).setdefault(what, [None, None])[end] = value
+                bar.advance(task)
+            bar.update(task, completed=2 * len(axes))
+    return result, {axis: breaks[axis] for axis in config.axes if axis in breaks}
+
+
+def _show(run: str, breaks: Breaks, config: StressConfig, policy: TrainedPolicy) -> None:
+    title = f"{run}: where less than 95 % work, each parameter alone"
+    table = Table(title=title, title_justify="left")
+    table.add_column("parameter")
+    for column in ("trained", "tried", "success", "settled"):
+        table.add_column(column, justify="right")
+    for name, found in breaks.items():
+        axis = config.axis(name, policy)
+        trained = axis.trained(policy.config.randomization, policy.config.env)
+        table.add_row(
+            f"{name} ({axis.operation})",
+            " to ".join(f"{value:.3g}" for value in dict.fromkeys(trained)),
+            f"{axis.low:g} to {axis.high:g}",
+            *(_beyond(found[what]) for what in ("success", "settled")),
+        )
+    Console().print(table)
+
+
+def _beyond(ends: list[float | None]) -> str:
+    said = [f"{sign} {end:.3g}" for sign, end in zip("<>", ends, strict=True) if end is not None]
+    return ", ".join(said) or "nowhere"
+
+
+if __name__ == "__main__":
+    cli.main("stress", _stress, _check)
