@@ -19,6 +19,7 @@ PARTS = {
     "gym": "the Gymnasium envs, against one written by hand and Stable-Baselines3's vector env",
     "startup": "how soon commands answer, how soon the first frame is there, and how long a thousand episodes take",
     "collection": "collection by one process and by two, against a bare PyBullet loop; and by each collector",
+    "engines": "steps of robots in PyBullet and in MuJoCo, with one thread and with two",
     "update": "learning from a batch, against PPO written by hand",
     "training": "time to 99 percent of unseen goals, against Stable-Baselines3 PPO",
     "algorithms": "time to 95 percent of unseen goals of every algorithm, against Stable-Baselines3's of the same name",
@@ -31,6 +32,7 @@ NEEDS = {  # the extra that a part needs, and its modules
     "training": ("bench", ["stable_baselines3"]),
     "algorithms": ("bench", ["stable_baselines3"]),
     "collection": ("ray", ["ray"]),
+    "engines": ("mujoco", ["mujoco"]),
     "growth": ("bench", ["psutil"]),
 }
 

@@ -44,9 +44,11 @@ def plot_maps(maps: "Mapping[str, Map]", output: Path) -> None:
     for axis in axes[-1]:
         axis.set_xlabel(_label(found.x.name, found.x.operation))
     figure.colorbar(mesh, ax=axes, label="% of goals", shrink=0.9)
-    lines = {"95 % work": ("black", "-"), "range of the training": ("crimson", "--")}
-    handles = [plt.Line2D([], [], color=color, linestyle=style, linewidth=2) for color, style in lines.values()]
-    figure.legend(handles, list(lines), loc="outside lower center", ncols=2, frameon=False)
+    handles = [
+        plt.Line2D([], [], color="black", linewidth=2, label="95 % work"),
+        plt.Line2D([], [], color="crimson", linewidth=2, linestyle="--", label="range of the training"),
+    ]
+    figure.legend(handles=handles, loc="outside lower center", ncols=2, frameon=False)
     figure.savefig(output, dpi=130)
     plt.close(figure)
 
