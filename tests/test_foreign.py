@@ -5,6 +5,7 @@ import json
 import shutil
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from omegaconf import OmegaConf
@@ -167,7 +168,12 @@ def test_what_the_user_types_must_be_what_the_run_folder_says(own, capsys):
 @pytest.mark.slow
 def test_a_run_of_ones_own_parts_is_judged_and_exported_where_it_was_trained(own, monkeypatch):
     exported = []
-    monkeypatch.setattr(artifact, "export_policy", lambda *_, config: exported.append(config))
+
+    def export(*_, config):
+        exported.append(config)
+        return SimpleNamespace(raw={"evaluation": {"transfer": None}})
+
+    monkeypatch.setattr(artifact, "export_policy", export)
     config = validate(TrainConfig, compose("train", [*TINY, EXPORTED, "env.task._target_=mypackage.Mine"]))
     with train._ending(config, own):
         run_training(config, own, resume=True)
