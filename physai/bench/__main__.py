@@ -1,4 +1,4 @@
-"""``python -m physai.bench``: physai against what it stands on, and Stable-Baselines3 (see ``--help``)."""
+"""``python -m physai.bench``: physai against what it stands on, and its peers (see ``--help``)."""
 
 import argparse
 from importlib import import_module
@@ -21,7 +21,7 @@ PARTS = {
     "collection": "collection by one process and by two, against a bare PyBullet loop; and by each collector",
     "engines": "steps of robots in PyBullet and in MuJoCo, with one thread and with two",
     "update": "learning from a batch, against PPO written by hand",
-    "training": "time to 99 percent of unseen goals, against Stable-Baselines3 PPO",
+    "training": "time to 99 percent of unseen goals, against the PPO of Stable-Baselines3, rsl_rl and SBX",
     "algorithms": "time to 95 percent of unseen goals of every algorithm, against Stable-Baselines3's of the same name",
     "growth": "time and memory of training against frames and robots",
 }
@@ -64,14 +64,14 @@ def _options() -> argparse.Namespace:
         parser.add_argument(f"--{part}", dest="parts", action="append_const", const=part, help=meaning)
     parser.add_argument("--seed", type=int, default=0, help="seed of all sides (0)")
     parser.add_argument("--seeds", type=int, default=5, help="train so often, with seeds counting up (5)")
-    sb3_seconds = "when Stable-Baselines3 gives up a training; what physai is ahead by is then a lower bound (100)"
-    parser.add_argument("--sb3-seconds", type=float, default=100.0, help=sb3_seconds)
+    peer_seconds = "when a peer gives up a training; what physai is ahead by is then a lower bound (100)"
+    parser.add_argument("--peer-seconds", type=float, default=100.0, help=peer_seconds)
     figure = Path("outputs/growth.png")
     parser.add_argument("--figure", type=Path, default=figure, help=f"where --growth draws ({figure})")
     options = parser.parse_args()
     options.parts = options.parts or list(PARTS)
-    if options.seed < 0 or options.seeds < 1 or options.sb3_seconds <= 0:
-        parser.error("--seed must not be negative, --seeds and --sb3-seconds must be positive")
+    if options.seed < 0 or options.seeds < 1 or options.peer_seconds <= 0:
+        parser.error("--seed must not be negative, --seeds and --peer-seconds must be positive")
     return options
 
 

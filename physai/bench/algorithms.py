@@ -6,7 +6,7 @@ from rich.table import Table
 
 from physai.bench import sb3
 from physai.bench.timing import reacher, table
-from physai.bench.training import GOALS, GOALS_SEED, Race, race_physai, race_sb3
+from physai.bench.training import GOALS, GOALS_SEED, Race, race_peer, race_physai
 from physai.training.agent import make_evaluation_env
 
 ALGORITHMS = ("ppo", "a2c", "sac", "td3", "ddpg")
@@ -15,15 +15,15 @@ TARGET = 0.95
 
 def run(options: Namespace) -> Table:
     """Measure, and show it."""
-    return algorithms_table(measure_algorithms(options.seed, options.sb3_seconds))
+    return algorithms_table(measure_algorithms(options.seed, options.peer_seconds))
 
 
-def measure_algorithms(seed: int, sb3_seconds: float) -> dict[str, tuple[Race, Race]]:
+def measure_algorithms(seed: int, peer_seconds: float) -> dict[str, tuple[Race, Race]]:
     """Race with default settings on one robot that is not randomized.
 
     Args:
         seed: Of all.
-        sb3_seconds: When Stable-Baselines3 gives up.
+        peer_seconds: When Stable-Baselines3 gives up.
 
     Returns:
         By algorithm, physai's race and Stable-Baselines3's.
@@ -35,7 +35,7 @@ def measure_algorithms(seed: int, sb3_seconds: float) -> dict[str, tuple[Race, R
         try:
             ours = race_physai(config, Race(f"physai {name}", TARGET), evaluator)
             learner = sb3.Learner(sb3.as_it_comes(name), seed)
-            races[name] = ours, race_sb3(learner, Race(f"SB3 {name}", TARGET), evaluator, max_seconds=sb3_seconds)
+            races[name] = ours, race_peer(learner, Race(f"SB3 {name}", TARGET), evaluator, max_seconds=peer_seconds)
         finally:
             evaluator.close()
     return races

@@ -9,7 +9,6 @@ import gymnasium
 import numpy as np
 import torch
 from gymnasium import spaces
-from numpy.typing import NDArray
 from stable_baselines3 import A2C, DDPG, PPO, SAC, TD3
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.env_util import make_vec_env
@@ -17,13 +16,10 @@ from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 from torch import Tensor, nn
 
-from physai.bench.timing import median_speeds
+from physai.bench.learner import Array, RestartingRobots
 from physai.envs.gym_env import RobotVectorEnv
 
-THREADS = (1, 2)
 SLOWEST_RATE = 0.05  # of the learning rate, when the schedule has come to its end
-
-Array = NDArray[Any]
 
 
 class RobotVecEnv(VecEnv):
@@ -35,14 +31,14 @@ class RobotVecEnv(VecEnv):
     """
 
     def __init__(self, robots: RobotVectorEnv, features: bool = False) -> None:
-        self.robots, self.simulation, self.features = robots, robots.simulation, features
+        self.robots, self.simulation = robots, robots.simulation
+        self._restarting = RestartingRobots(robots, features)
         self._actions: Array = np.zeros(0)
         space = robots.single_observation_space
         assert isinstance(space, spaces.Box)
         low, high = space.low, space.high
         if features:
-            self.simulation.reset()
-            room = np.full(self._features().shape[1], np.inf, np.float32)
+            room = np.full(self._restarting.reset().shape[1] - len(low), np.inf, np.float32)
             low, high = np.concatenate([low, -room]), np.concatenate([high, room])
         super().__init__(robots.num_envs, spaces.Box(low, high), robots.single_action_space)
 
@@ -51,8 +47,7 @@ class RobotVecEnv(VecEnv):
         if self._seeds[0] is not None:
             self.simulation.seed(self._seeds[0])
         self._reset_seeds()
-        self.simulation.reset()
-        return self._observe()
+        return self._restarting.reset()
 
     def step_async(self, actions: Array) -> None:
         """Take note of the actions."""
@@ -60,29 +55,16 @@ class RobotVecEnv(VecEnv):
 
     def step_wait(self) -> tuple[Array, Array, Array, list[dict[str, Any]]]:
         """Apply the actions; returns observation, reward, done and info, the observation of rows that are done anew."""
-        reward, terminated, truncated = (value[:, 0] for value in self.simulation.step(self._actions))
-        observation, done = self._observe(), terminated | truncated
+        observation, last, reward, terminated, truncated = self._restarting.step(self._actions)
+        done = terminated | truncated
         infos: list[dict[str, Any]] = [{}] * self.num_envs  # rows that go on have nothing to say, and share it
-        if done.any():
-            for row in done.nonzero()[0]:
-                infos[row] = {"terminal_observation": observation[row], "TimeLimit.truncated": bool(truncated[row])}
-            self.simulation.reset(done)
-            observation = self._observe()
+        for row in done.nonzero()[0]:
+            infos[row] = {"terminal_observation": last[row], "TimeLimit.truncated": bool(truncated[row])}
         return observation, reward, done, infos
-
-    def _observe(self) -> Array:
-        now = self.simulation
-        return np.concatenate([now.observe(), self._features()], axis=1) if self.features else now.observe()
-
-    def _features(self) -> Array:
-        now = self.simulation
-        sensed = (now.state.joint_position, now.state.joint_velocity, now.goal)
-        with torch.no_grad():
-            return now.task.module(*(torch.from_numpy(value).float() for value in sensed))[1].numpy()
 
     def close(self) -> None:
         """Free the simulation."""
-        self.robots.close()
+        self._restarting.close()
 
     # The robots of a row are no objects of their own.
 
@@ -124,6 +106,10 @@ class Settings:
     features: bool = False
     horizon: int = 0
     trial: dict[str, Any] = field(default_factory=dict)
+
+    def learner(self, seed: int, threads: int = 1, **changed: Any) -> "Learner":
+        """Make the learner."""
+        return Learner(self, seed, threads, **changed)
 
 
 def _our_envs(num_envs: int, features: bool) -> VecEnv:
@@ -225,15 +211,3 @@ class Learner:
     def close(self) -> None:
         """Free the robots."""
         self._envs.close()
-
-
-def fastest_threads(name: str, settings: Settings) -> int:
-    """Measure which number of torch threads learns fastest."""
-    trials = [Learner(settings, 0, threads, **settings.trial) for threads in THREADS]
-    speeds = median_speeds(*(trial.learn for trial in trials), rounds=3)
-    for trial in trials:
-        trial.close()
-    threads = THREADS[speeds.index(max(speeds))]
-    measured = ", ".join(f"{speed:,.0f}/s with {n}" for n, speed in zip(THREADS, speeds, strict=True))
-    print(f"{name}, by torch threads: {measured}; it gets {threads}", flush=True)
-    return threads

@@ -1,4 +1,4 @@
-"""How soon a policy is trained, against Stable-Baselines3."""
+"""How soon a policy is trained, against Stable-Baselines3, rsl_rl and SBX."""
 
 import math
 import multiprocessing
@@ -8,11 +8,13 @@ from argparse import Namespace
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from importlib.util import find_spec
 
 from rich.table import Table
 from tensordict.nn import TensorDictModule
 
 from physai.bench import sb3
+from physai.bench.learner import Learner, Settings, fastest_threads
 from physai.bench.timing import reacher, table, timed
 from physai.envs.make import TransformedRobotEnv
 from physai.seeding import derive
@@ -81,30 +83,52 @@ def run_race(
 
 def run(options: Namespace) -> Table:
     """Measure, and show it."""
-    return training_table(measure_training(options.seed, options.seeds, options.sb3_seconds))
+    return training_table(measure_training(options.seed, options.seeds, options.peer_seconds))
 
 
-def measure_training(seed: int, seeds: int, sb3_seconds: float) -> dict[str, list[Race]]:
+def peers() -> dict[str, Settings]:
+    """The learners that are raced against, by name; those whose packages are not here are left out, and it is said."""
+    found: dict[str, Settings] = {
+        "SB3, tuned, physai's features": sb3.TUNED_WITH_FEATURES,
+        "SB3, tuned": sb3.TUNED,
+        "SB3, defaults": sb3.DEFAULTS,
+    }
+    if find_spec("rsl_rl"):
+        from physai.bench import rsl_rl
+
+        found |= {
+            "rsl_rl, tuned, physai's features": rsl_rl.TUNED_WITH_FEATURES,
+            "rsl_rl, tuned": rsl_rl.TUNED,
+            "rsl_rl, Isaac Lab's settings": rsl_rl.ISAAC_LAB,
+        }
+    if find_spec("sbx"):
+        from physai.bench import sbx
+
+        found |= {"SBX, tuned, physai's features": sbx.TUNED_WITH_FEATURES, "SBX, tuned": sbx.TUNED}
+    for package, name in (("rsl_rl", "rsl-rl-lib"), ("sbx", "sbx-rl")):
+        if not find_spec(package):
+            print(f"{name} is not here and is left out (pip install 'physai[bench]')", flush=True)
+    return found
+
+
+def measure_training(seed: int, seeds: int, peer_seconds: float) -> dict[str, list[Race]]:
     """Race on one robot that is not randomized, all with these seeds.
 
     Args:
         seed: The first seed.
         seeds: How many, counting up.
-        sb3_seconds: When Stable-Baselines3 gives up; tuned, it also does so when its learning rate has fallen.
+        peer_seconds: When a peer gives up; one whose learning rate falls also does so at its end.
 
     Returns:
         By the side's name, its races; physai comes first.
     """
     ours = {
         "physai": [],
+        "physai, physics=mujoco": ["physics=mujoco"],
         "physai, collector=single": ["collector=single"],
     }
-    theirs = {
-        "SB3, tuned, physai's features": sb3.TUNED_WITH_FEATURES,
-        "SB3, tuned": sb3.TUNED,
-        "SB3, defaults": sb3.DEFAULTS,
-    }
-    threads = {name: sb3.fastest_threads(name, settings) for name, settings in theirs.items()}
+    theirs = peers()
+    threads = {name: fastest_threads(name, settings) for name, settings in theirs.items()}
     plain = reacher(seed, "randomization=none")
     evaluator = make_evaluation_env(plain, plain.randomization, GOALS, GOALS_SEED)
     races: dict[str, list[Race]] = {name: [] for name in (*ours, *theirs)}
@@ -114,9 +138,9 @@ def measure_training(seed: int, seeds: int, sb3_seconds: float) -> dict[str, lis
                 config = reacher(one, "randomization=none", *overrides)
                 races[name].append(race_physai(config, Race(f"{name}, seed {one}"), evaluator))
             for name, settings in theirs.items():
-                learner = sb3.Learner(settings, one, threads[name])
-                limits = {"max_seconds": sb3_seconds, "max_frames": settings.horizon or math.inf}
-                races[name].append(race_sb3(learner, Race(f"{name}, seed {one}"), evaluator, **limits))
+                learner = settings.learner(one, threads[name])
+                limits = {"max_seconds": peer_seconds, "max_frames": settings.horizon or math.inf}
+                races[name].append(race_peer(learner, Race(f"{name}, seed {one}"), evaluator, **limits))
         return races
     finally:
         evaluator.close()
@@ -157,8 +181,8 @@ def _workers_at_rest() -> Iterator[None]:
             os.kill(worker, signal.SIGCONT)
 
 
-def race_sb3(learner: sb3.Learner, race: Race, evaluator: TransformedRobotEnv, **limits: float) -> Race:
-    """Let Stable-Baselines3 learn until the evaluator's goals are reached, or until a limit of ``run_race``."""
+def race_peer(learner: Learner, race: Race, evaluator: TransformedRobotEnv, **limits: float) -> Race:
+    """Let another library learn until the evaluator's goals are reached, or until a limit of ``run_race``."""
     policy = TensorDictModule(learner.act, in_keys=learner.in_keys, out_keys=["action"])
 
     def success_rate() -> float:

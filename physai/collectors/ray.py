@@ -11,6 +11,8 @@ from pathlib import Path
 from typing import Any
 
 os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # Ray would report its use to its makers
+# Of a computer that is gone, Ray prints the last forty lines of its log; here, one line says so.
+os.environ.setdefault("RAY_DEDUP_LOGS_SKIP_REGEX", "^(Raylet is terminated|The node with node id)")
 
 import ray
 from ray.exceptions import RayError, RayTaskError
@@ -85,6 +87,7 @@ class RobotRayCollector(RayCollector):
             if started := _descendants(os.getpid()) - others:
                 self._watcher = kill_with_this(started)  # most notice by themselves, two take a minute
         except BaseException:
+            self._ended = True  # there is nothing more to shut down, and Ray would start anew to look
             ray.shutdown()
             raise
 

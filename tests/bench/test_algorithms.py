@@ -35,7 +35,7 @@ def test_algorithms_race(monkeypatch):
     reacher = algorithms.reacher
     short = ("env.task.max_steps=10", "total_frames=2560")
     monkeypatch.setattr(algorithms, "reacher", lambda seed, *overrides: reacher(seed, *overrides, *short))
-    races = algorithms.measure_algorithms(seed=0, sb3_seconds=0.1)
+    races = algorithms.measure_algorithms(seed=0, peer_seconds=0.1)
     assert list(races) == ["a2c", "td3"]
     for ours, theirs in races.values():
         assert ours.frames >= 2560

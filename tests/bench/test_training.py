@@ -1,4 +1,4 @@
-"""Stable-Baselines3 is told of our robots what it expects, and all learners race, are timed and shown."""
+"""Other libraries are told of our robots what they expect, and all learners race, are timed and shown."""
 
 import multiprocessing
 import time
@@ -12,7 +12,7 @@ from rich.console import Console
 from stable_baselines3.common.vec_env import VecCheckNan
 from torch.distributions import Distribution
 
-from physai.bench import sb3, training
+from physai.bench import rsl_rl, sb3, sbx, training
 from physai.bench.sb3 import Learner, RobotVecEnv
 from physai.bench.training import Race, training_table
 from physai.envs.gym_env import RobotVectorEnv
@@ -126,15 +126,59 @@ def test_stable_baselines3_learns_batch_by_batch(name):
     learner = Learner(settings, seed=0, n_steps=16)
     model = learner.model
     model.env = VecCheckNan(model.env, raise_exception=True)
-    before = learner.act(*(torch.zeros(3, size) for size in (8, 12)[: len(learner.in_keys)]))
-    frames = 16 * model.n_envs
-    assert [learner.learn(), learner.learn()] == [frames, frames]
-    after = learner.act(*(torch.zeros(3, size) for size in (8, 12)[: len(learner.in_keys)]))
-    assert after.shape == (3, 2)
-    assert not torch.equal(before, after)
+    assert_learns(learner, frames := 16 * model.n_envs)
     left = 1 - frames / settings.horizon if settings.horizon else 1.0  # the second batch's
     assert model.policy.optimizer.param_groups[0]["lr"] == pytest.approx(settings.arguments["learning_rate"] * left)
     learner.close()
+
+
+@pytest.mark.parametrize("settings", [rsl_rl.ISAAC_LAB, rsl_rl.TUNED, rsl_rl.TUNED_WITH_FEATURES])
+def test_rsl_rl_learns_batch_by_batch(settings):
+    learner = replace(settings, robots=ROBOTS).learner(seed=0)
+    assert_learns(learner, ROBOTS * settings.steps)
+    learner.close()
+
+
+def test_sbx_learns_batch_by_batch():
+    learner = sbx.TUNED_WITH_FEATURES.learner(seed=0, n_steps=2, batch_size=128)
+    assert_learns(learner, 2 * learner.model.n_envs)
+    learner.close()
+
+
+def assert_learns(learner, frames):
+    seen = [torch.zeros(3, size) for size in (8, 12)[: len(learner.in_keys)]]
+    before = learner.act(*seen)
+    assert [learner.learn(), learner.learn()] == [frames, frames]
+    after = learner.act(*seen)
+    assert after.shape == (3, 2)
+    assert after.abs().max() <= 1
+    assert not torch.equal(before, after)
+
+
+def test_rsl_rl_sees_an_episode_of_the_gymnasium_vector_env():
+    """It restarts rows in the step that ends them, says which of them ran out of time, and clips what it is told."""
+    envs = rsl_rl.RobotVecEnv(RobotVectorEnv("reacher", ROBOTS, overrides=[SHORT, "env.task.tolerance=0.3"]))
+    twin = RobotVectorEnv("reacher", ROBOTS, overrides=[SHORT, "env.task.tolerance=0.3"])
+    envs.seed(0)
+    twin.simulation.seed(0)
+    twin.simulation.reset()
+    going, ends = np.ones(ROBOTS, bool), set()
+    for action in actions(20):
+        told = torch.from_numpy(3 * action)
+        observation, reward, done, extras = envs.step(told)
+        expected, expected_reward, terminated, truncated, _ = twin.step(np.clip(3 * action, -1, 1))
+        rows = going & ~done.numpy()
+        np.testing.assert_array_equal(observation["policy"].numpy()[rows], expected[rows])
+        np.testing.assert_array_equal(reward.numpy()[going], expected_reward[going])
+        assert (done.numpy() == (terminated | truncated))[going].all()
+        assert (extras["time_outs"].numpy() == (truncated & ~terminated))[going].all()
+        ends |= set(truncated[going & done.numpy()].tolist())
+        assert (envs.episode_length_buf[done] == 0).all()
+        going &= ~done.numpy()
+    envs.close()
+    twin.close()
+    assert not going.any()
+    assert ends == {True, False}
 
 
 def _count(counter):
@@ -200,11 +244,19 @@ def test_all_learners_race(monkeypatch):
         training, "reacher", lambda seed, *overrides: reacher(seed, *overrides, SHORT, "total_frames=4096")
     )
     quick = {"n_steps": 16, "batch_size": 64, "n_epochs": 1}
-    for name in ("DEFAULTS", "TUNED", "TUNED_WITH_FEATURES"):
-        settings = getattr(sb3, name)
-        monkeypatch.setattr(sb3, name, replace(settings, arguments=settings.arguments | quick, trial={}))
-    sides = training.measure_training(seed=0, seeds=1, sb3_seconds=0.1)
-    assert [len(races) for races in sides.values()] == [1] * 5
+    for library in (sb3, sbx):
+        for name in ("DEFAULTS", "TUNED", "TUNED_WITH_FEATURES"):
+            if settings := getattr(library, name, None):
+                monkeypatch.setattr(library, name, replace(settings, arguments=settings.arguments | quick, trial={}))
+    sides = training.measure_training(seed=0, seeds=1, peer_seconds=0.1)
+    assert [len(races) for races in sides.values()] == [1] * 11
     for name, races in sides.items():
         assert all(one.frames >= (4096 if name.startswith("physai") else 1) and one.seconds > 0 for one in races)
         assert name in shown(sides)
+
+
+def test_who_is_not_here_is_left_out_by_name(monkeypatch, capsys):
+    find = training.find_spec
+    monkeypatch.setattr(training, "find_spec", lambda name: None if name == "sbx" else find(name))
+    assert not [name for name in training.peers() if "SBX" in name]
+    assert "sbx-rl is not here and is left out" in capsys.readouterr().out

@@ -1,0 +1,145 @@
+"""Ray on two computers: the second one has no checkout, and nothing of physai but what a wheel installs.
+
+The second computer is a mount namespace, in which the checkout is not there. What it costs, a minute, buys the only
+sight of what a cluster does: that robots are built from what the wheel holds, and that one may lose a computer.
+"""
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import sysconfig
+import time
+import venv
+import zipfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from hatchling.builders.wheel import WheelBuilder
+
+from tests.training.processes import all_gone, command_of, descendants
+from tests.training.small import SMALL, assert_same_run, command
+
+pytest.importorskip("ray")
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(sys.platform != "linux", reason="a computer is a mount namespace here"),
+]
+
+CHECKOUT = Path(__file__).parents[2]
+RAY = "from ray.scripts.scripts import main; main()"
+OPTIONS = ["--block", "--node-ip-address=127.0.0.1", "--num-cpus=1"]
+SECOND = """
+mount --bind {packages} {folder}/packages
+mount -t tmpfs none {checkout}
+cd {folder}
+exec {folder}/venv/bin/python -c '{ray}' start {options} --address={address} --temp-dir={folder}/ray
+"""
+
+
+class Computers:
+    """A cluster of a head, which is this computer, and a second one that can be switched off and on."""
+
+    def __init__(self, folder: Path) -> None:
+        with socket.socket() as free:
+            free.bind(("127.0.0.1", 0))
+            self.address = f"127.0.0.1:{free.getsockname()[1]}"
+        port = self.address.partition(":")[2]
+        options = [*OPTIONS, f"--port={port}", f"--temp-dir={folder / 'head'}", "--include-dashboard=false"]
+        self.head = _start([sys.executable, "-c", RAY, "start", "--head", *options], cwd=folder)
+        self.folder = folder / "second"
+        self.second: subprocess.Popen[str] | None = None
+        self._install()
+
+    def _install(self) -> None:
+        venv.create(self.folder / "venv", symlinks=True)
+        [site] = self.folder.glob("venv/lib/python*/site-packages")
+        (self.folder / "packages").mkdir()
+        (site / "packages.pth").write_text(f"{self.folder / 'packages'}\n")
+        wheel = next(iter(WheelBuilder(str(CHECKOUT)).build(directory=str(self.folder), versions=["standard"])))
+        zipfile.ZipFile(wheel).extractall(site)
+
+    def switch_on(self) -> None:
+        """Let the second computer join."""
+        values = {
+            "packages": sysconfig.get_path("purelib"),
+            "folder": self.folder,
+            "checkout": CHECKOUT,
+            "ray": RAY,
+            "options": " ".join(OPTIONS),
+            "address": self.address,
+        }
+        script = SECOND.format(**values)
+        self.second = _start(["unshare", "--map-root-user", "--mount", "sh", "-ec", script], cwd=self.folder)
+
+    def switch_off(self) -> None:
+        """End the second computer as a power cut does."""
+        assert self.second is not None
+        for process in (self.second.pid, *descendants(self.second.pid)):
+            os.kill(process, signal.SIGKILL)
+        self.second.communicate()
+
+    def workers(self) -> set[str]:
+        """Where the processes that step robots find their Python."""
+        assert self.second is not None
+        found = {one for one in descendants(self.second.pid) if "WorkerCollector" in command_of(one)}
+        return {os.readlink(f"/proc/{one}/cwd") for one in found}
+
+    def close(self) -> None:
+        """Switch both off."""
+        for one in (self.head, self.second):
+            if one is not None and one.poll() is None:
+                started = descendants(one.pid)
+                one.terminate()
+                one.communicate()
+                assert all_gone(started)
+
+
+def _start(program: list[str], cwd: Path) -> "subprocess.Popen[str]":
+    process = subprocess.Popen(
+        program, cwd=cwd, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=os.environ
+    )
+    assert process.stdout is not None
+    said = []
+    for line in process.stdout:
+        said.append(line)
+        if "Ray runtime started" in line:
+            return process
+    pytest.fail("".join(said))
+
+
+@pytest.fixture
+def computers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Computers]:
+    monkeypatch.setenv("RAY_AUTH_MODE", "disabled")
+    monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
+    made = Computers(tmp_path)
+    yield made
+    made.close()
+
+
+def test_a_run_that_loses_a_computer_ends_in_one_line_and_goes_on_when_it_is_back(computers, tmp_path):
+    """To the same weights as if nothing had happened."""
+    joining = ["collector=ray", f"collector.ray_init.address={computers.address}"]
+    plain = command("train", *SMALL, "collector=multi_sync", "hydra.run.dir=plain", cwd=tmp_path)
+    assert plain.wait() == 0, plain.communicate()[0]
+
+    computers.switch_on()
+    # Above, both groups end this list: num_envs and frames_per_batch are SMALL's.
+    lost = command("train", *joining, *SMALL, "hydra.run.dir=lost", cwd=tmp_path)
+    saved = tmp_path / "lost" / "checkpoints"
+    while lost.poll() is None and len(list(saved.glob("0*.pt"))) < 2:
+        time.sleep(0.02)
+    assert computers.workers() == {str(computers.folder)}
+    computers.switch_off()
+    output = lost.communicate(timeout=120)[0]
+    assert lost.returncode == 2, output
+    assert [line for line in output.splitlines() if "error" in line.lower()] == [output.splitlines()[-1]]
+    assert "a process that collects has ended" in output.splitlines()[-1]
+    assert "raylet" not in output.lower()
+
+    computers.switch_on()
+    again = command("train", "resume=lost", cwd=tmp_path)
+    assert again.wait() == 0, again.communicate()[0]
+    assert_same_run(tmp_path / "plain", tmp_path / "lost")
