@@ -296,7 +296,9 @@ def _faults(node: Any, allow: Sequence[str], resume: bool) -> Iterator[_Fault]:
             if last in _NO_KEYS or (last[:1] == "_" and last not in _HYDRAS):
                 reason = "a run folder may not decide this"
             elif resume and value is not None and (last in _OUTSIDE or _leaves_ray(key, value)):
-                reason = f"{shown(value)} is outside of the run folder; if you want it, say so beside resume=..."
+                group = "collector=ray " if _leaves_ray(key, value) else ""  # without it, there is no such key
+                beside = f"resume=... {group}{'.'.join(map(str, key))}=..."
+                reason = f"{shown(value)} is outside of the run folder; if you want it, say so: {beside}"
         if reason:
             yield _Fault(key, value, reason)
 

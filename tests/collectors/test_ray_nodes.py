@@ -15,6 +15,7 @@ import venv
 import zipfile
 from collections.abc import Iterator
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import pytest
 from hatchling.builders.wheel import WheelBuilder
@@ -35,19 +36,20 @@ SECOND = """
 mount --bind {packages} {folder}/packages
 mount -t tmpfs none {checkout}
 cd {folder}
-exec {folder}/venv/bin/python -c '{ray}' start {options} --address={address} --temp-dir={folder}/ray
+exec {folder}/venv/bin/python -c '{ray}' start {options} --address={address} --temp-dir={sockets}/second
 """
 
 
 class Computers:
     """A cluster of a head, which is this computer, and a second one that can be switched off and on."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, sockets: Path) -> None:
+        self._sockets = sockets
         with socket.socket() as free:
             free.bind(("127.0.0.1", 0))
             self.address = f"127.0.0.1:{free.getsockname()[1]}"
         port = self.address.partition(":")[2]
-        options = [*OPTIONS, f"--port={port}", f"--temp-dir={folder / 'head'}", "--include-dashboard=false"]
+        options = [*OPTIONS, f"--port={port}", f"--temp-dir={sockets / 'head'}", "--include-dashboard=false"]
         self.head = _start([sys.executable, "-c", RAY, "start", "--head", *options], cwd=folder)
         self.folder = folder / "second"
         self.second: subprocess.Popen[str] | None = None
@@ -66,6 +68,7 @@ class Computers:
         values = {
             "packages": sysconfig.get_path("purelib"),
             "folder": self.folder,
+            "sockets": self._sockets,
             "checkout": CHECKOUT,
             "ray": RAY,
             "options": " ".join(OPTIONS),
@@ -77,9 +80,7 @@ class Computers:
     def switch_off(self) -> None:
         """End the second computer as a power cut does."""
         assert self.second is not None
-        for process in (self.second.pid, *descendants(self.second.pid)):
-            os.kill(process, signal.SIGKILL)
-        self.second.communicate()
+        _cut_power(self.second)
 
     def workers(self) -> set[str]:
         """Where the processes that step robots find their Python."""
@@ -91,10 +92,15 @@ class Computers:
         """Switch both off."""
         for one in (self.head, self.second):
             if one is not None and one.poll() is None:
-                started = descendants(one.pid)
-                one.terminate()
-                one.communicate()
-                assert all_gone(started)
+                _cut_power(one)
+
+
+def _cut_power(computer: "subprocess.Popen[str]") -> None:
+    started = {computer.pid, *descendants(computer.pid)}
+    for process in started:
+        os.kill(process, signal.SIGKILL)
+    computer.communicate()
+    assert all_gone(started)
 
 
 def _start(program: list[str], cwd: Path) -> "subprocess.Popen[str]":
@@ -114,19 +120,17 @@ def _start(program: list[str], cwd: Path) -> "subprocess.Popen[str]":
 def computers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Computers]:
     monkeypatch.setenv("RAY_AUTH_MODE", "disabled")
     monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
-    made = Computers(tmp_path)
-    yield made
-    made.close()
+    with TemporaryDirectory(prefix="ray", ignore_cleanup_errors=True) as short:  # paths of sockets have 107 bytes
+        made = Computers(tmp_path, Path(short))
+        yield made
+        made.close()
 
 
 def test_a_run_that_loses_a_computer_ends_in_one_line_and_goes_on_when_it_is_back(computers, tmp_path):
     """To the same weights as if nothing had happened."""
     joining = ["collector=ray", f"collector.ray_init.address={computers.address}"]
     plain = command("train", *SMALL, "collector=multi_sync", "hydra.run.dir=plain", cwd=tmp_path)
-    assert plain.wait() == 0, plain.communicate()[0]
-
     computers.switch_on()
-    # Above, both groups end this list: num_envs and frames_per_batch are SMALL's.
     lost = command("train", *joining, *SMALL, "hydra.run.dir=lost", cwd=tmp_path)
     saved = tmp_path / "lost" / "checkpoints"
     while lost.poll() is None and len(list(saved.glob("0*.pt"))) < 2:
@@ -140,6 +144,7 @@ def test_a_run_that_loses_a_computer_ends_in_one_line_and_goes_on_when_it_is_bac
     assert "raylet" not in output.lower()
 
     computers.switch_on()
-    again = command("train", "resume=lost", cwd=tmp_path)
+    again = command("train", "resume=lost", *joining, cwd=tmp_path)
     assert again.wait() == 0, again.communicate()[0]
+    assert plain.wait() == 0, plain.communicate()[0]
     assert_same_run(tmp_path / "plain", tmp_path / "lost")
