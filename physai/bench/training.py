@@ -6,14 +6,16 @@ import os
 import signal
 from argparse import Namespace
 from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
+from importlib import import_module
 from importlib.util import find_spec
+from typing import Any
 
 from rich.table import Table
 from tensordict.nn import TensorDictModule
 
-from physai.bench import sb3
 from physai.bench.learner import Learner, Settings, fastest_threads
 from physai.bench.timing import reacher, table, timed
 from physai.envs.make import TransformedRobotEnv
@@ -81,67 +83,96 @@ def run_race(
     return race
 
 
+OURS = {
+    "physai": (),
+    "physai, physics=mujoco": ("physics=mujoco",),
+    "physai, collector=single": ("collector=single",),
+}
+# By name, a package, a module here and its settings; a process imports only the libraries that race in it.
+PEERS = {
+    "SB3, tuned, physai's features": ("stable_baselines3", "sb3", "TUNED_WITH_FEATURES"),
+    "SB3, tuned": ("stable_baselines3", "sb3", "TUNED"),
+    "SB3, defaults": ("stable_baselines3", "sb3", "DEFAULTS"),
+    "rsl_rl, tuned, physai's features": ("rsl_rl", "rsl_rl", "TUNED_WITH_FEATURES"),
+    "rsl_rl, tuned": ("rsl_rl", "rsl_rl", "TUNED"),
+    "rsl_rl, Isaac Lab's settings": ("rsl_rl", "rsl_rl", "ISAAC_LAB"),
+    "SBX, tuned, physai's features": ("sbx", "sbx", "TUNED_WITH_FEATURES"),
+    "SBX, tuned": ("sbx", "sbx", "TUNED"),
+}
+
+
+@dataclass(frozen=True)
+class Conditions:
+    """What all races have in common.
+
+    Attributes:
+        peer_seconds: When a peer gives up; one whose learning rate falls also does so at its end.
+        goals: How many each evaluation has.
+        overrides: Of the config of the robots and of physai.
+    """
+
+    peer_seconds: float
+    goals: int = GOALS
+    overrides: tuple[str, ...] = ()
+
+
 def run(options: Namespace) -> Table:
     """Measure, and show it."""
-    return training_table(measure_training(options.seed, options.seeds, options.peer_seconds))
+    return training_table(measure_training(options.seed, options.seeds, Conditions(options.peer_seconds)))
 
 
-def peers() -> dict[str, Settings]:
-    """The learners that are raced against, by name; those whose packages are not here are left out, and it is said."""
-    found: dict[str, Settings] = {
-        "SB3, tuned, physai's features": sb3.TUNED_WITH_FEATURES,
-        "SB3, tuned": sb3.TUNED,
-        "SB3, defaults": sb3.DEFAULTS,
-    }
-    if find_spec("rsl_rl"):
-        from physai.bench import rsl_rl
-
-        found |= {
-            "rsl_rl, tuned, physai's features": rsl_rl.TUNED_WITH_FEATURES,
-            "rsl_rl, tuned": rsl_rl.TUNED,
-            "rsl_rl, Isaac Lab's settings": rsl_rl.ISAAC_LAB,
-        }
-    if find_spec("sbx"):
-        from physai.bench import sbx
-
-        found |= {"SBX, tuned, physai's features": sbx.TUNED_WITH_FEATURES, "SBX, tuned": sbx.TUNED}
-    for package, name in (("rsl_rl", "rsl-rl-lib"), ("sbx", "sbx-rl")):
-        if not find_spec(package):
-            print(f"{name} is not here and is left out (pip install 'physai[bench]')", flush=True)
-    return found
-
-
-def measure_training(seed: int, seeds: int, peer_seconds: float) -> dict[str, list[Race]]:
+def measure_training(seed: int, seeds: int, conditions: Conditions) -> dict[str, list[Race]]:
     """Race on one robot that is not randomized, all with these seeds.
+
+    Each race has a process of its own: what one library leaves behind, such as JAX's threads, is none of the others'
+    business. Peers whose packages are not here are left out, and it is said.
 
     Args:
         seed: The first seed.
         seeds: How many, counting up.
-        peer_seconds: When a peer gives up; one whose learning rate falls also does so at its end.
+        conditions: Of all races.
 
     Returns:
         By the side's name, its races; physai comes first.
     """
-    ours = {
-        "physai": [],
-        "physai, physics=mujoco": ["physics=mujoco"],
-        "physai, collector=single": ["collector=single"],
-    }
-    theirs = peers()
-    threads = {name: fastest_threads(name, settings) for name, settings in theirs.items()}
-    plain = reacher(seed, "randomization=none")
-    evaluator = make_evaluation_env(plain, plain.randomization, GOALS, GOALS_SEED)
-    races: dict[str, list[Race]] = {name: [] for name in (*ours, *theirs)}
+    here = {name: peer for name, peer in PEERS.items() if find_spec(peer[0])}
+    for name in PEERS.keys() - here.keys():
+        print(f"{name}: {PEERS[name][0]} is not here; left out (pip install 'physai[bench]')", flush=True)
+    threads = {name: _apart(_fastest_threads, name) for name in here}
+    races: dict[str, list[Race]] = {name: [] for name in (*OURS, *here)}
+    for one in range(seed, seed + seeds):  # the sides take turns, so that a busy machine slows them alike
+        for name in races:
+            races[name].append(_apart(_race, name, one, threads.get(name, 1), conditions))
+    return races
+
+
+def _apart(function: Callable[..., Any], *arguments: Any) -> Any:
+    """Call in a process of its own."""
+    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as executor:
+        return executor.submit(function, *arguments).result()
+
+
+def _settings(name: str) -> Settings:
+    _, module, settings = PEERS[name]
+    found: Settings = getattr(import_module(f"physai.bench.{module}"), settings)
+    return found
+
+
+def _fastest_threads(name: str) -> int:
+    return fastest_threads(name, _settings(name))
+
+
+def _race(name: str, seed: int, threads: int, conditions: Conditions) -> Race:
+    config = reacher(seed, "randomization=none", *OURS.get(name, ()), *conditions.overrides)
+    plain = reacher(seed, "randomization=none", *conditions.overrides)
+    evaluator = make_evaluation_env(plain, plain.randomization, conditions.goals, GOALS_SEED)
+    race = Race(f"{name}, seed {seed}")
     try:
-        for one in range(seed, seed + seeds):  # the sides take turns, so that a busy machine slows them alike
-            for name, overrides in ours.items():
-                config = reacher(one, "randomization=none", *overrides)
-                races[name].append(race_physai(config, Race(f"{name}, seed {one}"), evaluator))
-            for name, settings in theirs.items():
-                learner = settings.learner(one, threads[name])
-                limits = {"max_seconds": peer_seconds, "max_frames": settings.horizon or math.inf}
-                races[name].append(race_peer(learner, Race(f"{name}, seed {one}"), evaluator, **limits))
-        return races
+        if name in OURS:
+            return race_physai(config, race, evaluator)
+        settings = _settings(name)
+        limits = {"max_seconds": conditions.peer_seconds, "max_frames": settings.horizon or math.inf}
+        return race_peer(settings.learner(seed, threads), race, evaluator, **limits)
     finally:
         evaluator.close()
 
@@ -160,7 +191,7 @@ def race_physai(config: TrainConfig, race: Race, evaluator: TransformedRobotEnv)
     def success_rate() -> float:
         evaluator.normalizer.load_state_dict(agent.statistics.normalizer.state_dict())
         with _workers_at_rest():
-            return evaluate(agent.actor, evaluator, GOALS, GOALS_SEED).success_rate
+            return evaluate(agent.actor, evaluator, evaluator.batch_size[0], GOALS_SEED).success_rate
 
     try:
         return run_race(race, learn, success_rate, max_frames=config.total_frames)
@@ -186,7 +217,7 @@ def race_peer(learner: Learner, race: Race, evaluator: TransformedRobotEnv, **li
     policy = TensorDictModule(learner.act, in_keys=learner.in_keys, out_keys=["action"])
 
     def success_rate() -> float:
-        return evaluate(policy, evaluator, GOALS, GOALS_SEED).success_rate
+        return evaluate(policy, evaluator, evaluator.batch_size[0], GOALS_SEED).success_rate
 
     try:
         return run_race(race, learner.learn, success_rate, **limits)

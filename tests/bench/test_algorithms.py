@@ -30,7 +30,6 @@ def test_the_table_says_who_did_not_arrive():
 def test_algorithms_race(monkeypatch):
     monkeypatch.setattr(algorithms, "ALGORITHMS", ("a2c", "td3"))
     monkeypatch.setattr(algorithms, "GOALS", 20)
-    monkeypatch.setattr("physai.bench.training.GOALS", 20)
     monkeypatch.setattr("physai.bench.training.JUDGE_EVERY", 256)
     reacher = algorithms.reacher
     short = ("env.task.max_steps=10", "total_frames=2560")

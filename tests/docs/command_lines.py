@@ -10,6 +10,7 @@ import tomllib
 import yaml
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, OmegaConf
+from ray.scripts.scripts import cli
 
 from physai.bench.__main__ import _options
 from physai.compose import compose
@@ -60,6 +61,8 @@ def check(words: Sequence[str]) -> None:
             assert assignment.partition("=")[0] in SOURCES + (ROOT / "pyproject.toml").read_text()
         case ["ros2", *rest]:
             _check_ros2(rest)
+        case ["ray", name, *rest]:
+            cli.commands[name].make_context(name, list(rest))
         case _:
             pytest.fail(f"nobody knows how to check {' '.join(words)}")
 
