@@ -29,7 +29,7 @@ NEEDS = {  # the extra that a part needs, and its modules
     "policy": ("onnx", onnx.PACKAGES),
     "ros": ("ros", ["rclpy"]),
     "gym": ("bench", ["stable_baselines3"]),
-    "training": ("bench", ["stable_baselines3"]),
+    "training": ("bench,mujoco", ["stable_baselines3", "mujoco"]),
     "algorithms": ("bench", ["stable_baselines3"]),
     "collection": ("ray", ["ray"]),
     "engines": ("mujoco", ["mujoco"]),

@@ -27,6 +27,7 @@ from physai.training.evaluation import evaluate
 TARGET = 0.99
 GOALS = 1000
 GOALS_SEED = derive(0, "benchmark goals")  # the same for all, unseen in training
+FAST_ENGINE = ("physics=mujoco", f"physics.threads={os.cpu_count()}")  # PyBullet would judge for most of the time
 JUDGE_EVERY = 4096  # frames, and
 JUDGE_SHARE = 1 / 16  # of those so far: slow learners would spend their time on being judged
 
@@ -164,8 +165,8 @@ def _fastest_threads(name: str) -> int:
 
 def _race(name: str, seed: int, threads: int, conditions: Conditions) -> Race:
     config = reacher(seed, "randomization=none", *OURS.get(name, ()), *conditions.overrides)
-    plain = reacher(seed, "randomization=none", *conditions.overrides)
-    evaluator = make_evaluation_env(plain, plain.randomization, conditions.goals, GOALS_SEED)
+    judged = reacher(seed, "randomization=none", *FAST_ENGINE, *conditions.overrides)
+    evaluator = make_evaluation_env(judged, judged.randomization, conditions.goals, GOALS_SEED)
     race = Race(f"{name}, seed {seed}")
     try:
         if name in OURS:

@@ -92,7 +92,9 @@ class guard:  # noqa: N801
     """
 
     def __enter__(self) -> None:
-        self._before = {number: signal.signal(number, lambda number, _: sys.exit(128 + number)) for number in _SIGNALS}
+        # One that is ignored already stays so: that is what nohup asks for.
+        heard = [number for number in _SIGNALS if signal.getsignal(number) is not signal.SIG_IGN]
+        self._before = {number: signal.signal(number, lambda number, _: sys.exit(128 + number)) for number in heard}
 
     def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
         for number, handler in self._before.items():

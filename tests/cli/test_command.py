@@ -1,0 +1,16 @@
+"""How commands end."""
+
+import signal
+import subprocess
+import sys
+
+
+def test_what_nohup_started_goes_on_when_its_terminal_is_closed():
+    program = (
+        "import os, signal; from physai import cli; signal.signal(signal.SIGHUP, signal.SIG_IGN)\n"
+        "with cli.guard(): os.kill(os.getpid(), signal.SIGHUP); print('goes on', flush=True)\n"
+        "with cli.guard(): os.kill(os.getpid(), signal.SIGTERM); print('is lost', flush=True)"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60)
+    assert done.returncode == 128 + signal.SIGTERM
+    assert done.stdout == "goes on\n"
