@@ -3,6 +3,7 @@
 import datetime
 import hashlib
 from importlib.metadata import version
+from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
@@ -45,7 +46,8 @@ def describe_robot(simulation: Simulation, policy: DeployablePolicy) -> dict[str
 
 def describe_origin(git_commit: str | None) -> dict[str, Any]:
     """What made the file, and when."""
-    packages = ("torch", "torchrl", "tensordict", "pybullet", "numpy")
+    packages = ["torch", "torchrl", "tensordict", "numpy"]
+    packages += [engine for engine in ("pybullet", "mujoco") if find_spec(engine)]  # one of them is enough
     return {
         "format": FORMAT,
         "format_version": FORMAT_VERSION,

@@ -25,11 +25,14 @@ def make_viewer(simulation: Simulation, window: bool = False) -> "Viewer":
     """Make a viewer for these robots; it has a world of its own.
 
     Raises:
-        UserError: If a window is asked for where there is no screen.
+        UserError: If a window is asked for where there is no screen, or if there is nothing that draws.
     """
     from physai.errors import UserError
-    from physai.physics.viewer import Viewer
 
+    try:
+        from physai.physics.viewer import Viewer
+    except ModuleNotFoundError as error:
+        raise UserError(f"pictures of robots need {error.name}, which has no wheels for Pythons after 3.11") from error
     if window and not has_screen():
         raise UserError("there is no screen here (DISPLAY is not set): render images instead of a window")
     home = torch.from_numpy(simulation.spec.home).float()
