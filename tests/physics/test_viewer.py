@@ -1,10 +1,13 @@
 """Pictures: a goal is seen where it is, in the plane, in space, and as where joints would bring a robot."""
 
+import sys
+
 import numpy as np
 import pytest
 
 from physai.envs.simulation import Simulation
 from physai.envs.viewing import make_viewer, show
+from physai.errors import UserError
 
 HOLD = ("~env.task", "+env.task={_target_: tests.tasks.hold.Hold, hold: 0.1, max_steps: 80}")
 
@@ -51,3 +54,12 @@ def test_a_goal_of_joints_is_shown_where_they_bring_the_end_effector(simulate):
     pose = simulation.state.joint_position[1]
     np.testing.assert_array_equal(show(viewer, simulation, row=1), viewer.show(pose, place))
     assert abs(centre(show(viewer, simulation))[1] - centre(show(viewer, simulation, row=1))[1]) > 20
+
+
+def test_without_pybullet_there_is_one_line_and_no_picture(simulate, monkeypatch):
+    """As on Python 3.12 and later, for which there are no wheels of it."""
+    simulation, _ = simulate()
+    monkeypatch.setitem(sys.modules, "pybullet", None)
+    monkeypatch.delitem(sys.modules, "physai.physics.viewer")
+    with pytest.raises(UserError, match="pictures of robots need pybullet"):
+        make_viewer(simulation)
