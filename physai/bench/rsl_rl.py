@@ -82,7 +82,7 @@ class Settings:
     activation: str = "elu"
     normalized: bool = False
     features: bool = False
-    horizon: int = 0  # where the learning rate does not follow the divergence of policies
+    horizon: int = 0
     trial: dict[str, Any] = field(default_factory=dict)
 
     def learner(self, seed: int, threads: int = 1, **changed: Any) -> "Learner":

@@ -83,7 +83,7 @@ class Computers:
         _cut_power(self.second)
 
     def workers(self) -> set[str]:
-        """Where the processes that step robots find their Python."""
+        """The folders in which its processes step robots."""
         assert self.second is not None
         found = {one for one in descendants(self.second.pid) if "WorkerCollector" in command_of(one)}
         return {os.readlink(f"/proc/{one}/cwd") for one in found}
