@@ -125,7 +125,8 @@ def differences(config: EnvConfig, other: dict[str, Any]) -> list[str]:
     """Move each joint alone in two engines, and say what an arm in the other one does differently.
 
     What is looked for: joints that turn the other way or in another order, commands that arrive later, motors with
-    less or more effort than the same limit allows. How fast a drive closes in on its command is no difference.
+    less or more effort than the same limit allows. How fast a drive closes in on its command is no difference, nor is
+    the inertia of its rotor, which is left out here: a motor that has more to turn seems weaker.
 
     Args:
         config: Robot and engine of the training.
@@ -134,7 +135,10 @@ def differences(config: EnvConfig, other: dict[str, Any]) -> list[str]:
     Returns:
         One line a difference.
     """
-    expected, found = (_respond(config.model_copy(update={"physics": physics})) for physics in (config.physics, other))
+    engines = (
+        {key: 0.0 if key == "armature" else value for key, value in one.items()} for one in (config.physics, other)
+    )
+    expected, found = (_respond(config.model_copy(update={"physics": engine})) for engine in engines)
     joints, lines = config.robot.joints, []
     moves = np.abs(found.moved).argmax(axis=1)
     for told, joint in enumerate(joints):

@@ -5,7 +5,7 @@ from typing import Literal
 
 import numpy as np
 
-from physai.config import Count, PositiveFloat
+from physai.config import Count, NonNegativeFloat, PositiveFloat
 from physai.errors import UserError
 from physai.physics.impulse import FASTEST, limit_velocity, motor_velocity
 from physai.physics.interface import DynamicsParameters, RobotState, nominal_dynamics
@@ -45,6 +45,7 @@ class MuJoCoPhysics:
         substeps: Physics steps per control period, at least.
         motor: Which motor.
         motor_time_constant: Of a servo with a velocity gain of 1, s.
+        armature: Inertia of a servo's rotor, as the joint feels it through the gears, kg·m².
         threads: Among which the robots are divided; no result depends on it.
 
     Raises:
@@ -62,13 +63,14 @@ class MuJoCoPhysics:
         *,
         motor: Literal["impulse", "servo"],
         motor_time_constant: PositiveFloat,
+        armature: NonNegativeFloat,
         threads: Count,
     ) -> None:
         self.num_robots = num_robots
         self._spec = spec
         if motor == "servo":
             substeps = max(substeps, math.ceil(_STEPS_PER_TIME_CONSTANT * control_dt / motor_time_constant))
-        model = _make_model(spec, motor, control_dt / substeps)
+        model = _make_model(spec, motor, armature, control_dt / substeps)
         self._batch = Batch(model, num_robots, threads)
         self._position, self._velocity = self._batch.bind("qpos"), self._batch.bind("qvel")
         self._links = [model.body(name).id for name in spec.moving_links]
@@ -201,13 +203,14 @@ class _Servo:
         self._batch.step(nstep=self._substeps)
 
 
-def _make_model(spec: RobotSpec, motor: str, time_step: float) -> "mujoco.MjModel":
+def _make_model(spec: RobotSpec, motor: str, armature: float, time_step: float) -> "mujoco.MjModel":
     try:
         made = mujoco.MjSpec.from_string(urdf.without_shapes(spec.urdf, spec.joints).decode())
         made.compiler.fusestatic = False  # a link keeps its mass to itself
         for joint in made.joints:
             joint.actfrclimited = False  # the effort limit is the motor's, each robot's own
             if motor == "servo":
+                joint.armature = armature
                 actuator = made.add_actuator(name=joint.name, target=joint.name)
                 actuator.trntype, actuator.biastype = mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtBias.mjBIAS_AFFINE
                 actuator.forcelimited, actuator.forcerange = True, [-1.0, 1.0]

@@ -15,7 +15,7 @@ from physai.errors import UserError
 from physai.physics import ParameterLayout, RandomizationConfig
 from physai.physics.mujoco import MuJoCoPhysics
 from physai.robots import RobotSpec
-from tests.physics.conftest import ENGINES
+from tests.physics.conftest import ENGINES, MOTOR
 from tests.physics.moving import DT, commands, dynamics, reset_all, resting, run, start, wild
 
 STEPS = 200
@@ -88,9 +88,7 @@ def test_neither_companions_nor_threads_change_a_bit(spec, motor):
         some = dataclasses.replace(
             begin, joint_position=begin.joint_position[rows], joint_velocity=begin.joint_velocity[rows]
         )
-        made = MuJoCoPhysics(
-            spec, len(some.joint_position), DT, motor=motor, motor_time_constant=0.015, threads=threads
-        )
+        made = MuJoCoPhysics(spec, len(some.joint_position), DT, motor=motor, **MOTOR | {"threads": threads})
         reset_all(made, some, {key: value[rows] for key, value in parameters.items()})
         ways.append(run(made, given[:, rows]))
     np.testing.assert_array_equal(ways[0], ways[1])
@@ -101,7 +99,7 @@ def test_neither_companions_nor_threads_change_a_bit(spec, motor):
 @pytest.mark.parametrize("fastest", [0.015, 0.05])
 def test_a_servo_closes_in_with_its_time_constant(planar, substeps, fastest):
     gain = np.array([1.0, 0.5])
-    physics = MuJoCoPhysics(planar, 2, DT, substeps, motor="servo", motor_time_constant=fastest, threads=1)
+    physics = MuJoCoPhysics(planar, 2, DT, substeps, motor="servo", **MOTOR | {"motor_time_constant": fastest})
     parameters = dynamics(planar, 2, velocity_gain=gain, effort_limit=100.0, joint_friction=0.0, joint_damping=0.0)
     reset_all(physics, resting(2), parameters)
     position = run(physics, np.tile([1.0, 0.0], (100, 2, 1)))[-1, 0, :, 0]
@@ -116,6 +114,16 @@ def test_a_servo_s_effort_is_limited_and_dry_friction_holds_what_is_too_weak_for
     strong, weak, stuck = run(physics, np.tile([1.0, 0.0], (3, 3, 1)))[2, 1, :, 0]
     assert strong > 2 * weak > 0.1
     assert abs(stuck) < 0.02  # MuJoCo's friction creeps
+
+
+def test_a_servo_with_a_heavier_rotor_speeds_its_joint_up_more_slowly(planar):
+    speeds = []
+    for armature in (0.0, 1.0):
+        physics = MuJoCoPhysics(planar, 1, DT, motor="servo", **MOTOR | {"armature": armature})
+        reset_all(physics, resting(1, [0.0, np.pi / 2]), dynamics(planar, 1, effort_limit=1.0, joint_friction=0.0))
+        speeds.append(physics.step(np.array([[0.0, 5.0]])).joint_velocity[0, 1])
+    assert speeds[1] == pytest.approx(1.0 * DT / 1.0, rel=0.05)  # effort · time / inertia: the arm's is small beside it
+    assert speeds[0] > 10 * speeds[1]
 
 
 def test_a_servo_pushes_a_joint_little_beyond_its_limit(planar):
