@@ -322,7 +322,7 @@ def test_that_come_again_after_three_seconds_move_nothing_before_a_new_goal(loop
     since = time.monotonic()
     loop.peer.wait_state("waiting", after=since)
     loop.peer.all_zeros(after=since, commands=30)
-    assert "no goal yet" in loop.diagnosis()[1]
+    wait_for(lambda: "no goal yet" in loop.diagnosis()[1])  # on a busy computer it holds for a moment
     wait_for(lambda: any("goal forgotten: the robot was silent for 3" in line for line in loop.node.lines))
     loop.start_from_here()
 
