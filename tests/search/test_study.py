@@ -69,6 +69,7 @@ def test_values_that_were_not_all_taken_again_when_the_search_was_killed_are_tak
     with opened(tmp_path) as study:
         run, trial = study.ask()
         assert (run, trial.params) == (0, params)
+        assert study.ask()[0] == 1
 
 
 def test_trials_that_were_interrupted_are_tried_again_and_those_that_ended_are_not(tmp_path):
@@ -85,15 +86,6 @@ def test_trials_that_were_interrupted_are_tried_again_and_those_that_ended_are_n
         assert [trial.state.name for trial in study.trials().values()] == [
             "COMPLETE", "FAIL", "PRUNED", "RUNNING", "RUNNING",
         ]  # fmt: skip
-
-
-def test_a_kill_between_enqueueing_and_telling_repeats_nothing_twice(tmp_path):
-    with opened(tmp_path) as study:
-        _, trial = study.ask()
-        study._study.enqueue_trial(trial.params, user_attrs={"run": 0})
-    with opened(tmp_path) as study:
-        assert study.ask()[0] == 0
-        assert study.ask()[0] == 1
 
 
 @pytest.mark.parametrize(
