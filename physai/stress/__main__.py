@@ -1,9 +1,10 @@
 """``python -m physai.stress``: find out where a policy stops to work (see ``--help``)."""
 
+import contextlib
 import json
 import sys
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 from omegaconf import DictConfig
 from pydantic import Field
@@ -12,7 +13,7 @@ from rich.progress import Progress
 from rich.table import Table
 
 from physai import cli
-from physai.config import Config, Count, PackageName, Seed, validate
+from physai.config import Count, Seed, validate
 from physai.errors import UserError
 from physai.evaluate import PolicyChoice
 from physai.files import write_atomically
@@ -24,7 +25,7 @@ Breaks = dict[str, dict[str, list[float | None]]]
 """By axis, for ``success`` and ``settled``: the last values that work, towards the low and the high end."""
 
 
-class StressConfig(Config):
+class StressConfig(PolicyChoice):
     """``conf/stress.yaml``."""
 
     run: str | Annotated[list[str], Field(min_length=1)]
@@ -34,11 +35,6 @@ class StressConfig(Config):
     episodes: Count
     breaks: bool
     output: str | None
-    allow: list[PackageName]
-    env: dict[str, Any] | None
-    physics: dict[str, Any] | None
-    randomization: dict[str, Any] | None
-    checkpoint: str | int
     seed: Seed
     axes: dict[str, AxisConfig]
 
@@ -46,11 +42,6 @@ class StressConfig(Config):
     def runs(self) -> list[str]:
         """The run folders."""
         return [self.run] if isinstance(self.run, str) else self.run
-
-    def load(self, run: str) -> TrainedPolicy:
-        """The policy of one of them."""
-        same = {name: getattr(self, name) for name in PolicyChoice.model_fields if name != "run"}
-        return PolicyChoice(run=run, **same).load()
 
     def axis(self, name: str, policy: TrainedPolicy) -> Axis:
         """An axis, for the robots of a policy."""
@@ -60,11 +51,8 @@ class StressConfig(Config):
         """All axes that the robots of a policy have."""
         found = []
         for name in self.axes:
-            try:
+            with contextlib.suppress(UserError):
                 found.append(self.axis(name, policy))
-            except UserError:
-                if name in (self.x, self.y):
-                    raise
         return found
 
 

@@ -1,6 +1,5 @@
 """A whole stress test: the cells of a map and the break values, on all cores."""
 
-import contextlib
 import multiprocessing
 import os
 from collections.abc import Callable, Iterator, Sequence
@@ -73,22 +72,16 @@ class StressTest:
     """
 
     def __init__(self, policy: TrainedPolicy, episodes: int, seed: int) -> None:
-        self._policy, self._episodes, self._seed = policy, episodes, seed
-        self._stack = contextlib.ExitStack()
+        self._policy, self._episodes = policy, episodes
+        worker = (os.getpid(), policy, episodes, seed)
+        context = multiprocessing.get_context("fork")
+        self._pool = ProcessPoolExecutor(len(os.sched_getaffinity(0)), context, _begin, worker)
 
     def __enter__(self) -> "StressTest":
-        pool = ProcessPoolExecutor(
-            len(os.sched_getaffinity(0)),
-            multiprocessing.get_context("fork"),
-            _begin,
-            (os.getpid(), self._policy, self._episodes, self._seed),
-        )
-        self._pool = pool
-        self._stack.callback(pool.shutdown, cancel_futures=True)
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._stack.close()
+        self._pool.shutdown(cancel_futures=True)
 
     def map(self, x: Axis, y: Axis, grid: int, advance: Callable[[], object] = lambda: None) -> Map:
         """Try a grid of values; ``advance`` is called for each cell that is done."""
