@@ -17,9 +17,9 @@ from torch import Tensor
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from physai.artifact import fresh_process
-from physai.artifact.module import VIEWS, DeployablePolicy, as_tuple, input_signals
+from physai.artifact.module import VIEWS, DeployablePolicy, as_tuple
 from physai.artifact.states import States
-from physai.deploy.metadata import LAST_COMMAND, NEW_MEMORY, Metadata
+from physai.deploy.metadata import ERROR, LAST_COMMAND, MEMORY, NEW_MEMORY, Metadata
 from physai.deploy.policy import load_module
 from physai.envs.make import TransformedRobotEnv
 from physai.envs.simulation import Simulation
@@ -38,8 +38,6 @@ Function = Callable[..., Tensor | tuple[Tensor, ...]]
 
 Answers = dict[str, Tensor]
 """What a policy gives for S states, by name, [S, ...] each: its outputs, and ``error``."""
-
-ERROR = "error"
 
 
 class GateError(UserError):
@@ -84,7 +82,7 @@ def answers(form: Any, policy: DeployablePolicy, states: States) -> Answers:
     return _named([*policy.out_keys, ERROR], rows)
 
 
-def _named(names: Sequence[str], rows: Iterable[tuple[Tensor, ...]]) -> Answers:
+def _named(names: Sequence[str], rows: Iterable[Sequence[Tensor]]) -> Answers:
     return {name: torch.cat(column) for name, column in zip(names, zip(*rows, strict=True), strict=True)}
 
 
@@ -134,16 +132,12 @@ def check_against_env(
     for key, answer, expected in zip(policy.out_keys, as_tuple(policy(*met.values())), acted, strict=False):
         compare(stage, key, answer, expected, met, BATCH_TOLERANCE)
 
-    see, act = _seeing(env), acting(actor, env)
-    for row in states.rows():
-        seen = see(row)
-        for key, view in zip(VIEWS, _views(policy, row), strict=True):
-            compare(stage, key, view, seen.get(key), row)
-        given = as_tuple(policy(*row.values())), as_tuple(act(*row.values()))
-        for key, answer, expected in zip(policy.out_keys, *given, strict=True):
-            compare(stage, key, answer, expected, row)
-        where = row["joint_position"], row["goal"]
-        compare(stage, ERROR, policy.error(*where), env.simulation.task.module.error(*where), row)
+    see, act, error = _seeing(env), acting(actor, env), env.simulation.task.module.error
+    seen = map(see, states.rows())
+    found = _named(VIEWS, (_views(policy, row) for row in states.rows())) | answers(policy, policy, states)
+    expected = _named(VIEWS, ([one.get(key) for key in VIEWS] for one in seen)) | outputs(act, policy, states)
+    expected[ERROR] = torch.cat([error(row["joint_position"], row["goal"]) for row in states.rows()])
+    compare_answers(stage, found, expected, states)
 
 
 def _views(policy: DeployablePolicy, states: States) -> list[Tensor]:
@@ -166,7 +160,7 @@ def _seeing(env: TransformedRobotEnv) -> Callable[[States], TensorDictBase]:
 def acting(actor: TensorDictModuleBase, env: TransformedRobotEnv) -> Function:
     """The trained policy itself, behind its env's transforms, as a function of what a robot senses."""
     see, memory_size = _seeing(env), getattr(actor, "memory_size", 0)
-    names = [signal.name for signal in input_signals(env.simulation, memory_size)]
+    names = [*(signal.name for signal in env.simulation.sensed), *([MEMORY] if memory_size else [])]
 
     @torch.no_grad()
     def act(*inputs: Tensor) -> tuple[Tensor, ...]:
@@ -250,14 +244,9 @@ def check_metadata(metadata: Metadata, simulation: Simulation, policy: Deployabl
         GateError: If a part differs; it says which.
     """
     spec, task = simulation.spec, simulation.task
-    true = {
+    of_robot = ("joints", "home", "position_limit", "velocity_limit", "effort_limit", "command_limit")
+    true = {key: getattr(spec, key) for key in of_robot} | {
         "robot": spec.name,
-        "joints": spec.joints,
-        "home": spec.home,
-        "position_limit": spec.position_limit,
-        "velocity_limit": spec.velocity_limit,
-        "effort_limit": spec.effort_limit,
-        "command_limit": spec.command_limit,
         "control_rate": 1.0 / simulation.config.control_dt,
         "inputs": policy.inputs,
         "outputs": policy.outputs,

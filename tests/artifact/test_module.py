@@ -2,8 +2,6 @@
 
 import pytest
 import torch
-from tensordict import TensorDict
-from tensordict.nn import TensorDictSequential
 
 from physai.artifact.module import make_deployable, save, script
 from physai.compose import compose
@@ -81,17 +79,6 @@ def test_it_is_frozen_and_goes_its_own_way():
     assert not policy.training
     assert policy.in_keys == ["joint_position", "joint_velocity", "goal"]
     assert policy.out_keys == ["joint_velocity_command"]
-    env.close()
-
-
-def test_it_acts_on_a_tensordict_as_other_modules_do():
-    actor, env = untrained()
-    policy = make_deployable(actor, env)
-    inputs = sensed(5)
-    tensordict = TensorDict(dict(zip(policy.in_keys, inputs, strict=True)), [5])
-    assert torch.equal(policy(tensordict)["joint_velocity_command"], policy(*inputs))
-    again = TensorDictSequential(policy)(tensordict.select(*policy.in_keys))
-    assert torch.equal(again["joint_velocity_command"], policy(*inputs))
     env.close()
 
 
