@@ -117,7 +117,7 @@ class Metadata:
         if not joints or not all(isinstance(name, str) for name in joints) or len(set(joints)) != len(joints):
             raise PolicyError("metadata: robot.joints must be distinct names")
         n = len(joints)
-        position = _array(raw, "limits.position", (n, 2), infinite=True)
+        position = _array(raw, "limits.position", (n, 2), null=[-math.inf, math.inf])
         if not (position[:, 0] < position[:, 1]).all():
             raise PolicyError("metadata: limits.position must be pairs of lower and upper limit")
         inputs, outputs = _signals(raw, "inputs"), _signals(raw, "outputs")
@@ -239,8 +239,7 @@ def _bounds(raw: dict[str, Any], key: str, size: int, infinite: float) -> tuple[
     listed = _get(raw, key, list)
     if not listed:
         return ()
-    values = _array(raw, key, (size,), nothing=infinite)
-    return tuple(values.tolist())
+    return tuple(_array(raw, key, (size,), null=infinite).tolist())
 
 
 def _check_signals(inputs: tuple[Signal, ...], outputs: tuple[Signal, ...], joints: tuple[str, ...]) -> None:
@@ -305,9 +304,8 @@ def _array(
     raw: dict[str, Any],
     key: str,
     shape: tuple[int, ...],
-    infinite: bool = False,
     kind: type = np.float64,
-    nothing: float | None = None,
+    null: float | list[float] | None = None,  # what null stands for: JSON has no infinity
 ) -> np.ndarray:
     value = _get(raw, key, object)
     try:
@@ -319,11 +317,9 @@ def _array(
         raise PolicyError(f"metadata: {key} must hold numbers") from error
     if array.shape != shape:
         raise PolicyError(f"metadata: {key} must have the shape {list(shape)}, not {list(array.shape)}")
-    if infinite:  # JSON has no infinity: null stands for a limit that does not exist
-        array = np.where(np.isnan(array), np.array([-math.inf, math.inf]), array)
-    elif nothing is not None:
-        array = np.where(np.isnan(array), nothing, array)
-    elif not np.isfinite(array).all():
+    if null is not None:
+        return np.where(np.isnan(array), null, array)
+    if not np.isfinite(array).all():
         raise PolicyError(f"metadata: {key} must be finite")
     return array
 
