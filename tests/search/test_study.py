@@ -162,7 +162,7 @@ def test_trials_without_a_value_are_in_the_report_and_do_not_win(tmp_path, capsy
         pruned = study.ask()[1]
         pruned.report(-0.9, 1)
         study.tell(pruned)
-        report = Report(tmp_path, study, 6)
+        report = Report(tmp_path, study)
         report.ended(4)
         report.summary(["threads=1"])
         best = study.trials()[2].params
@@ -180,6 +180,6 @@ def test_a_search_whose_trials_all_fail_ends_in_one_line_and_exit_code_1(tmp_pat
     with opened(tmp_path) as study:
         study.tell(study.ask()[1], error="the loss is not finite")
         with pytest.raises(SystemExit) as stop:
-            Report(tmp_path, study, 1).summary([])
+            Report(tmp_path, study).summary([])
     assert stop.value.code == 1
     assert capsys.readouterr().err == "error: none of 1 trials came to an end; the output.txt of each says why\n"
