@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import TensorDictModuleBase
+from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
@@ -24,7 +24,6 @@ from physai.deploy.policy import load_module
 from physai.envs.make import TransformedRobotEnv
 from physai.envs.simulation import Simulation
 from physai.errors import UserError
-from physai.robots import JointCommand
 from physai.training.evaluation import Evaluation, evaluate
 from physai.transforms import Observation, ObservationNormalization
 
@@ -44,12 +43,11 @@ class GateError(UserError):
     """The exported policy is not the trained one: which stage, which input, how much."""
 
 
-def compare(stage: str, what: str, found: Tensor, expected: Tensor, states: States, tolerance: float = 0.0) -> float:
-    """Return the largest difference of two [S, m] tensors.
+def compare_answers(stage: str, found: Answers, expected: Answers, states: States, tolerance: float = 0.0) -> float:
+    """Return the largest difference of answers, whose names are for the error.
 
     Args:
         stage: Name of the stage, for the error.
-        what: What is compared, for the error.
         found: What the exported policy gives.
         expected: What it should give.
         states: The inputs, S of them.
@@ -58,17 +56,20 @@ def compare(stage: str, what: str, found: Tensor, expected: Tensor, states: Stat
     Raises:
         GateError: If they differ by more, or are not numbers.
     """
-    if found.shape != expected.shape:
-        raise GateError(f"{stage}: {what} has the shape {list(found.shape)}, not {list(expected.shape)}")
-    difference = (found.double() - expected.double()).abs().nan_to_num(nan=torch.inf)
-    worst = float(difference.max())
-    if worst > tolerance:
-        row = int(difference.max(dim=1).values.argmax())
-        raise GateError(
-            f"{stage}: {what} differs by {worst:.3g} (allowed: {tolerance:g}) at {states.describe(row)}: "
-            f"{found[row].tolist()}, not {expected[row].tolist()}"
-        )
-    return worst
+    worst = [0.0]
+    for what, wanted in expected.items():
+        given = found.get(what, wanted[:, :0])
+        if given.shape != wanted.shape:
+            raise GateError(f"{stage}: {what} has the shape {list(given.shape)}, not {list(wanted.shape)}")
+        difference = (given.double() - wanted.double()).abs().nan_to_num(nan=torch.inf)
+        worst.append(float(difference.max()))
+        if worst[-1] > tolerance:
+            row = int(difference.max(dim=1).values.argmax())
+            raise GateError(
+                f"{stage}: {what} differs by {worst[-1]:.3g} (allowed: {tolerance:g}) at {states.describe(row)}: "
+                f"{given[row].tolist()}, not {wanted[row].tolist()}"
+            )
+    return max(worst)
 
 
 def outputs(function: Function, policy: DeployablePolicy, states: States) -> Answers:
@@ -84,17 +85,6 @@ def answers(form: Any, policy: DeployablePolicy, states: States) -> Answers:
 
 def _named(names: Sequence[str], rows: Iterable[Sequence[Tensor]]) -> Answers:
     return {name: torch.cat(column) for name, column in zip(names, zip(*rows, strict=True), strict=True)}
-
-
-def compare_answers(stage: str, found: Answers, expected: Answers, states: States, tolerance: float = 0.0) -> float:
-    """Compare answers, by default to the last bit; return the largest difference.
-
-    Raises:
-        GateError: If a command, a memory or an error differs.
-    """
-    return max(
-        compare(stage, key, found.get(key, part[:, :0]), part, states, tolerance) for key, part in expected.items()
-    )
 
 
 @torch.no_grad()
@@ -124,13 +114,12 @@ def check_against_env(
     met = States({key: rollout.get(key) for key in policy.in_keys})
     for key, view in zip(VIEWS, _views(policy, met), strict=True):
         scale = rollout.get(key).abs().max().clamp(min=1.0)
-        compare(stage, key, view / scale, rollout.get(key) / scale, met, BATCH_TOLERANCE)
+        compare_answers(stage, {key: view / scale}, {key: rollout.get(key) / scale}, met, BATCH_TOLERANCE)
     told = env.simulation.joint_command.of_arrays(
         *(rollout.get(key, rollout.get("joint_position")).numpy() for key in ("action", "joint_position", LAST_COMMAND))
     )
-    acted = (torch.from_numpy(told).float(), rollout.get(NEW_MEMORY, None))
-    for key, answer, expected in zip(policy.out_keys, as_tuple(policy(*met.values())), acted, strict=False):
-        compare(stage, key, answer, expected, met, BATCH_TOLERANCE)
+    acted = dict(zip(policy.out_keys, (torch.from_numpy(told).float(), rollout.get(NEW_MEMORY, None)), strict=False))
+    compare_answers(stage, _named(policy.out_keys, [as_tuple(policy(*met.values()))]), acted, met, BATCH_TOLERANCE)
 
     see, act, error = _seeing(env), acting(actor, env), env.simulation.task.module.error
     seen = map(see, states.rows())
@@ -177,7 +166,7 @@ def acting(actor: TensorDictModuleBase, env: TransformedRobotEnv) -> Function:
 
 def unroll(function: Function, policy: DeployablePolicy, states: States) -> Answers:
     """Let a policy remember S states, one after the other, from a memory of zeros on."""
-    memory = torch.zeros(1, states.memory_size)
+    memory = torch.zeros_like(states[MEMORY][:1])
 
     def remember(*inputs: Tensor) -> tuple[Tensor, ...]:
         nonlocal memory
@@ -313,7 +302,7 @@ def check_drive(
     Raises:
         GateError: If its success rate is not that of the actor on the same goals.
     """
-    driven = evaluate(FileDriver(content, policy, env.simulation.joint_command), env, episodes, seed)
+    driven = drive(content, policy, env, episodes, seed)
     trained = evaluate(actor, env, episodes, seed)
     if abs(driven.success_rate - trained.success_rate) > SUCCESS_TOLERANCE:
         raise GateError(
@@ -323,19 +312,14 @@ def check_drive(
     return driven
 
 
-class FileDriver(TensorDictModuleBase):
-    """A policy file in the place of the actor: sees only what a robot senses, and what it remembers."""
+def drive(content: bytes, policy: DeployablePolicy, env: TransformedRobotEnv, episodes: int, seed: int) -> Evaluation:
+    """Evaluate a TorchScript file in the place of the actor: it sees what a robot senses, and what it remembers."""
+    module, joint_command = load_module(content, policy.in_keys), env.simulation.joint_command
 
-    def __init__(self, content: bytes, policy: DeployablePolicy, joint_command: JointCommand) -> None:
-        super().__init__()
-        self.in_keys = policy.in_keys
-        self.out_keys = ["action", *policy.out_keys[1:]]
-        self.module = load_module(content, self.in_keys)
-        self.joint_command = joint_command
+    def act(*inputs: Tensor) -> tuple[Tensor, ...]:
+        command, *memory = as_tuple(module(*inputs))
+        given = dict(zip(policy.in_keys, inputs, strict=True))
+        return joint_command.action(command, given.get(LAST_COMMAND, command)), *memory
 
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write ``action``, and what is remembered."""
-        command, *memory = as_tuple(self.module(*(tensordict.get(key) for key in self.in_keys)))
-        last_command = tensordict.get(LAST_COMMAND, command)
-        action = self.joint_command.action(command, last_command)
-        return tensordict.update(dict(zip(self.out_keys, (action, *memory), strict=True)))
+    actor = TensorDictModule(act, in_keys=policy.in_keys, out_keys=["action", *policy.out_keys[1:]])
+    return evaluate(actor, env, episodes, seed)

@@ -28,18 +28,9 @@ class States(dict[str, Tensor]):
         """S."""
         return len(next(iter(self.values())))
 
-    @property
-    def memory_size(self) -> int:
-        """H, or 0."""
-        return self[MEMORY].shape[1] if MEMORY in self else 0
-
-    def row(self, index: int) -> "States":
-        """One state, [1, ...] each."""
-        return States({key: value[index : index + 1] for key, value in self.items()})
-
     def rows(self) -> Iterable["States"]:
-        """All states, one by one."""
-        return map(self.row, range(len(self)))
+        """All states, one by one, [1, ...] each."""
+        return (States({key: value[row : row + 1] for key, value in self.items()}) for row in range(len(self)))
 
     def describe(self, index: int) -> str:
         """One state in words; of a long value, the first numbers."""

@@ -6,13 +6,13 @@ from typing import Any
 
 import numpy as np
 
-from physai.artifact.gate import FileDriver, GateError
+from physai.artifact.gate import GateError, drive
 from physai.artifact.module import DeployablePolicy
 from physai.compose import compose
 from physai.config import not_installed
 from physai.envs.simulation import EnvConfig, Simulation
 from physai.errors import UserError
-from physai.training.evaluation import MAX_ROBOTS, Evaluation, evaluate
+from physai.training.evaluation import MAX_ROBOTS, Evaluation
 from physai.training.run import TrainedPolicy
 
 LOWEST = 0.97  # success rate in the other engine that a policy must have for certain (lower bound of 95 %)
@@ -100,7 +100,7 @@ def ask(
     found = differences(config, physics)
     _, env = trained.deploy(min(episodes, MAX_ROBOTS), seed, config.model_copy(update={"physics": physics}))
     try:
-        driven = evaluate(FileDriver(content, policy, env.simulation.joint_command), env, episodes, seed)
+        driven = drive(content, policy, env, episodes, seed)
     finally:
         env.close()
     return Opinion(physics, driven, found, episodes, trained.randomization.name)
