@@ -2,14 +2,12 @@
 
 import contextlib
 import json
-import sys
 from pathlib import Path
 from typing import Annotated
 
 from omegaconf import DictConfig
 from pydantic import Field
 from rich.console import Console
-from rich.progress import Progress
 from rich.table import Table
 
 from physai import cli
@@ -18,11 +16,8 @@ from physai.errors import UserError
 from physai.evaluate import PolicyChoice
 from physai.files import write_atomically
 from physai.stress.axes import Axis, AxisConfig
-from physai.stress.run import Map, StressTest
+from physai.stress.run import Breaks, Map, StressTest
 from physai.training.run import TrainedPolicy
-
-Breaks = dict[str, dict[str, list[float | None]]]
-"""By axis, for ``success`` and ``settled``: the last values that work, towards the low and the high end."""
 
 
 class StressConfig(PolicyChoice):
@@ -78,8 +73,10 @@ def _stress(node: DictConfig, _: Path) -> None:
     name = f"stress_{config.x}_{config.y}"
     for run in config.runs:
         policy = config.load(run)
-        found, breaks = _try(config, policy, run)
-        maps[run] = found
+        x, y = (config.axis(axis, policy) for axis in (config.x, config.y))
+        with StressTest(policy, config.episodes, config.seed, run) as test:
+            found = maps[run] = test.map(x, y, config.grid)
+            breaks = test.breaks(config.others(policy)) if config.breaks else {}
         summary = {
             "run": run,
             "checkpoint": config.checkpoint,
@@ -97,24 +94,6 @@ def _stress(node: DictConfig, _: Path) -> None:
     output = Path(config.output or (Path(config.runs[0]) if len(maps) == 1 else Path()) / f"{name}.png")
     plot_maps(maps, output)
     print(f"Map: {output}; figures: {', '.join(str(Path(run) / name) + '.json' for run in maps)}")
-
-
-def _try(config: StressConfig, policy: TrainedPolicy, run: str) -> tuple[Map, Breaks]:
-    x, y = (config.axis(name, policy) for name in (config.x, config.y))
-    breaks: Breaks = {}
-    bar = Progress(disable=not sys.stdout.isatty())
-    with StressTest(policy, config.episodes, config.seed) as test, bar:
-        task = bar.add_task(f"{run}: map", total=len(x.values(config.grid)) * len(y.values(config.grid)))
-        result = test.map(x, y, config.grid, lambda: bar.advance(task))
-        if config.breaks:
-            axes = config.others(policy)
-            task = bar.add_task(f"{run}: break values", total=2 * len(axes))
-            for axis, end, found in test.breaks(axes):
-                for what, value in found.items():
-                    breaks.setdefault(axis.name, {}).setdefault(what, [None, None])[end] = value
-                bar.advance(task)
-            bar.update(task, completed=2 * len(axes))
-    return result, {axis: breaks[axis] for axis in config.axes if axis in breaks}
 
 
 def _show(run: str, breaks: Breaks, config: StressConfig, policy: TrainedPolicy) -> None:
