@@ -78,8 +78,10 @@ def test_trials_that_were_interrupted_are_tried_again_and_those_that_ended_are_n
         study.tell(trials[0], 0.5)
         study.tell(trials[1], error="the loss is not finite")
         study.tell(trials[2])
+        trials[3].report(0.25, 2)
     with opened(tmp_path) as study:
         assert study.done() == 3
+        assert study.trials()[3].last_step == 2
         run, again = study.ask()
         assert (run, again.params) == (3, trials[3].params)
         assert study.ask()[0] == 4
