@@ -1,6 +1,7 @@
 """A second opinion: how a policy file drives in an engine that it was not trained in."""
 
 import importlib.util
+from contextlib import closing
 from dataclasses import dataclass
 from typing import Any
 
@@ -80,29 +81,24 @@ class Opinion:
             raise GateError(f"{said}, and {own.success_rate:.1%} in its own; at most {LARGEST_DROP:.0%} may be lost")
 
 
-def ask(
-    content: bytes, policy: DeployablePolicy, trained: TrainedPolicy, physics: dict[str, Any], episodes: int, seed: int
-) -> Opinion:
-    """Let a TorchScript file drive the robots of its run in another engine.
+def ask(content: bytes, policy: DeployablePolicy, trained: TrainedPolicy, episodes: int, seed: int) -> Opinion:
+    """Let a TorchScript file drive the robots of its run in the other engine.
 
     Args:
         content: The file.
         policy: What it was made from.
         trained: The policy of the run.
-        physics: The engine.
         episodes: How many goals.
         seed: Seeds them.
 
     Raises:
-        UserError: If the engine cannot load the robot.
+        UserError: If the engine is not installed, or cannot load the robot.
     """
-    config = trained.config.env
+    config, physics = trained.config.env, other_engine(trained.config.env.physics)
     found = differences(config, physics)
     _, env = trained.deploy(min(episodes, MAX_ROBOTS), seed, config.model_copy(update={"physics": physics}))
-    try:
+    with closing(env):
         driven = drive(content, policy, env, episodes, seed)
-    finally:
-        env.close()
     return Opinion(physics, driven, found, episodes, trained.randomization.name)
 
 
@@ -165,7 +161,7 @@ def _respond(config: EnvConfig) -> _Response:
     rows = joints * len(_SCALES)
     at_home = config.start.model_copy(update={"spread": [0.0] * joints, "carried_over": 0.0})
     simulation = Simulation(config.model_copy(update={"start": at_home}), 2 * rows, seed=0)
-    try:
+    with closing(simulation):
         told = np.tile(np.repeat(np.arange(joints), len(_SCALES)), 2)
         parameters = simulation.physics_parameters.copy()
         effort = simulation.layout.columns["effort_limit"].start + told
@@ -177,8 +173,6 @@ def _respond(config: EnvConfig) -> _Response:
         for _ in range(_STEPS):
             simulation.step(action)
             path.append(simulation.state.joint_position[:rows] - simulation.state.joint_position[rows:])
-    finally:
-        simulation.close()
     path_of = np.stack(path).reshape(_STEPS, joints, len(_SCALES), joints)  # [step, told, scale, moving]
     strong, of_told = path_of[:, :, 0], path_of[:, np.arange(joints), :, np.arange(joints)]  # [told, step, scale]
     most = np.abs(strong[-1]).argmax(axis=1)
