@@ -102,21 +102,6 @@ def ask(content: bytes, policy: DeployablePolicy, trained: TrainedPolicy, episod
     return Opinion(physics, driven, found, episodes, trained.randomization.name)
 
 
-@dataclass(frozen=True)
-class _Response:
-    """What n joints do when one of them is told to move, relative to what they do when none is.
-
-    Attributes:
-        moved: [joint told, joint moving], rad, at the end.
-        onset: Control steps until the joint that moves most does so, [n].
-        weak: How far the told joint gets with its effort limit scaled, rad, [scales, n].
-    """
-
-    moved: np.ndarray
-    onset: np.ndarray
-    weak: np.ndarray
-
-
 def differences(config: EnvConfig, other: dict[str, Any]) -> list[str]:
     """Move each joint alone in two engines, and say what an arm in the other one does differently.
 
@@ -130,23 +115,25 @@ def differences(config: EnvConfig, other: dict[str, Any]) -> list[str]:
     Returns:
         One line a difference.
     """
-    expected, found = (_respond(config.model_copy(update={"physics": physics})) for physics in (config.physics, other))
+    (own, own_onset, own_weak), (moved, onset, weak) = (
+        _respond(config.model_copy(update={"physics": physics})) for physics in (config.physics, other)
+    )
     joints, lines = config.robot.joints, []
-    moves = np.abs(found.moved).argmax(axis=1)
+    moves = np.abs(moved).argmax(axis=1)
     for told, joint in enumerate(joints):
         if moves[told] != told:
             lines.append(f"a command for {joint} moves {joints[moves[told]]}")
-        elif found.moved[told, told] * expected.moved[told, told] < 0:
+        elif moved[told, told] * own[told, told] < 0:
             lines.append(f"{joint} turns the other way")
     if lines:
         return lines
-    late = int(np.median(found.onset - expected.onset))
+    late = int(np.median(onset - own_onset))
     if abs(late) >= _LATE:
         lines.append(f"commands arrive {abs(late)} control steps {'later' if late > 0 else 'earlier'}")
-    full = np.abs(expected.moved.diagonal())
+    full = np.abs(own.diagonal())
     for number, joint in enumerate(joints):
-        scale = int(np.abs(expected.weak[:, number] / full[number] - 0.5).argmin())  # where the limit is what decides
-        share = float(found.weak[scale, number] / expected.weak[scale, number])
+        scale = int(np.abs(own_weak[:, number] / full[number] - 0.5).argmin())  # where the limit is what decides
+        share = float(weak[scale, number] / own_weak[scale, number])
         if not 0.7 < share < 1.4:
             less = "less" if share < 1 else "more"
             lines.append(
@@ -155,8 +142,15 @@ def differences(config: EnvConfig, other: dict[str, Any]) -> list[str]:
     return lines
 
 
-def _respond(config: EnvConfig) -> _Response:
-    """Rows of the simulation: each joint in turn at each scale of its effort limit; once told to move, once not."""
+def _respond(config: EnvConfig) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Tell each of n joints to move, alone, and see what they do, relative to what they do when none is told to.
+
+    Rows of the simulation: each joint in turn at each scale of its effort limit; once told to move, once not.
+
+    Returns:
+        How far they moved, rad, at the end, [joint told, joint moving]; control steps until the joint that moves most
+        does so, [n]; and how far the told joint gets with its effort limit scaled, rad, [scales, n].
+    """
     joints = len(config.robot.joints)
     rows = joints * len(_SCALES)
     at_home = config.start.model_copy(update={"spread": [0.0] * joints, "carried_over": 0.0})
@@ -178,4 +172,4 @@ def _respond(config: EnvConfig) -> _Response:
     most = np.abs(strong[-1]).argmax(axis=1)
     alone = np.abs(strong[:, np.arange(joints), most])  # [step, told]
     step = _SPEED * simulation.spec.command_limit * config.control_dt
-    return _Response(strong[-1], (alone > 0.2 * step).argmax(axis=0), np.abs(of_told[:, -1]).T)
+    return strong[-1], (alone > 0.2 * step).argmax(axis=0), np.abs(of_told[:, -1]).T
