@@ -18,26 +18,25 @@ if TYPE_CHECKING:
 
 
 class PolicyChoice(Config):
-    """Which policy, and the robots that it drives."""
+    """Which policy of a run, and the robots that it drives."""
 
-    run: str
     allow: list[PackageName]
     checkpoint: str | int
     env: dict[str, Any] | None
     physics: dict[str, Any] | None
     randomization: dict[str, Any] | None
 
-    def load(self) -> "TrainedPolicy":
+    def load(self, run: str) -> "TrainedPolicy":
         """Read it; raises a UserError if something is missing or damaged."""
         from physai.physics import RandomizationConfig
         from physai.training.run import TrainedPolicy, load_config
 
-        run_config = load_config(Path(self.run), self.allow)
+        run_config = load_config(Path(run), self.allow)
         env = self._env(run_config.env)
         randomization = None
         if self.randomization is not None:
             randomization = validate(RandomizationConfig, DictConfig(self.randomization))
-        return TrainedPolicy(Path(self.run), str(self.checkpoint), randomization, env, run_config)
+        return TrainedPolicy(Path(run), str(self.checkpoint), randomization, env, run_config)
 
     def _env(self, run: "EnvConfig") -> "EnvConfig | None":
         """The robots, where they are not just the run's: in its engine, unless another is chosen or comes along."""
@@ -56,20 +55,22 @@ class PolicyChoice(Config):
 class EvaluateConfig(PolicyChoice):
     """``conf/evaluate.yaml``."""
 
+    run: str
     episodes: Count
     in_a_row: Annotated[int, Field(ge=0)]
     seed: Seed | None
 
 
 def _check(node: DictConfig) -> None:
-    validate(EvaluateConfig, node).load()
+    config = validate(EvaluateConfig, node)
+    config.load(config.run)
 
 
 def _evaluate(node: DictConfig, _: Path) -> None:
     from physai.training.run import FINAL_SEED, print_summary
 
     config = validate(EvaluateConfig, node)
-    policy = config.load()
+    policy = config.load(config.run)
     seed = FINAL_SEED if config.seed is None else config.seed
     figures = policy.evaluate(config.episodes, seed).summary() | policy.in_a_row(config.in_a_row, seed)
     summary = figures | {

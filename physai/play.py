@@ -21,6 +21,7 @@ _PAUSE = 15  # frames to look at the arm at its goal
 class PlayConfig(PolicyChoice):
     """``conf/play.yaml``."""
 
+    run: str
     goals: Count
     seed: Seed
     render: Literal["video", "human"]
@@ -31,7 +32,7 @@ def _check(node: DictConfig) -> None:
     config = validate(PlayConfig, node)
     if config.output is not None and Path(config.output).suffix not in (".mp4", ".gif"):
         raise UserError(f"output: '{config.output}' must end in .mp4 or .gif")
-    config.load()
+    config.load(config.run)
 
 
 def _play(node: DictConfig, _: Path) -> None:
@@ -42,7 +43,7 @@ def _play(node: DictConfig, _: Path) -> None:
     from physai.envs.viewing import show as show_robot
 
     config = validate(PlayConfig, node)
-    actor, env = config.load().deploy(1, config.seed)
+    actor, env = config.load(config.run).deploy(1, config.seed)
     human = config.render == "human"
     viewer = make_viewer(env.simulation, window=human)
     dt = env.simulation.config.control_dt

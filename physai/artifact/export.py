@@ -4,6 +4,7 @@ import hashlib
 import json
 import tempfile
 from collections.abc import Callable, Sequence
+from contextlib import closing
 from pathlib import Path
 
 import torch
@@ -57,7 +58,7 @@ def export_policy(
     """
     trained = TrainedPolicy(run_dir, which, config=config)
     actor, env = trained.deploy(_ROBOTS, SEED)
-    try:
+    with closing(env):
         policy = make_deployable(actor, env)
         rollout, extremes = roll_out(actor, env), extreme_states(policy, env)
         work = States({key: rollout.get(key) for key in policy.in_keys})
@@ -127,8 +128,6 @@ def export_policy(
         if "torchscript" in formats:
             _publish(run_dir / FILES["torchscript"], final)
         return metadata
-    finally:
-        env.close()
 
 
 def _second_opinion(
@@ -136,15 +135,14 @@ def _second_opinion(
 ) -> transfer.Opinion | None:
     """Ask the other engine; None where it cannot be asked and need not be."""
     try:
-        physics = transfer.other_engine(trained.config.env.physics)
-        opinion = transfer.ask(content, policy, trained, physics, TRANSFER_EPISODES, SEED)
+        opinion = transfer.ask(content, policy, trained, TRANSFER_EPISODES, SEED)
     except UserError as error:
         if trained.config.export.transfer == "require":
             raise gate.GateError(f"export.transfer=require: {error}") from error
         report("drives in the other engine", f"not asked: {error}")
         return None
     there = opinion.evaluation
-    name = f"drives in {physics['_target_'].rpartition('.')[2].removesuffix('Physics')}"
+    name = f"drives in {opinion.physics['_target_'].rpartition('.')[2].removesuffix('Physics')}"
     report(name, f"reaches {there.success_rate:.1%} of {opinion.episodes:,} goals, stays at {there.settled_rate:.1%}")
     for difference in opinion.differences:
         report("", difference)

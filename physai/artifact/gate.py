@@ -12,19 +12,18 @@ from typing import Any
 import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import TensorDictModuleBase
+from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from physai.artifact import fresh_process
-from physai.artifact.module import VIEWS, DeployablePolicy, as_tuple, input_signals
+from physai.artifact.module import VIEWS, DeployablePolicy, as_tuple
 from physai.artifact.states import States
-from physai.deploy.metadata import LAST_COMMAND, NEW_MEMORY, Metadata
+from physai.deploy.metadata import ERROR, LAST_COMMAND, MEMORY, NEW_MEMORY, Metadata
 from physai.deploy.policy import load_module
 from physai.envs.make import TransformedRobotEnv
 from physai.envs.simulation import Simulation
 from physai.errors import UserError
-from physai.robots import JointCommand
 from physai.training.evaluation import Evaluation, evaluate
 from physai.transforms import Observation, ObservationNormalization
 
@@ -39,19 +38,16 @@ Function = Callable[..., Tensor | tuple[Tensor, ...]]
 Answers = dict[str, Tensor]
 """What a policy gives for S states, by name, [S, ...] each: its outputs, and ``error``."""
 
-ERROR = "error"
-
 
 class GateError(UserError):
     """The exported policy is not the trained one: which stage, which input, how much."""
 
 
-def compare(stage: str, what: str, found: Tensor, expected: Tensor, states: States, tolerance: float = 0.0) -> float:
-    """Return the largest difference of two [S, m] tensors.
+def compare_answers(stage: str, found: Answers, expected: Answers, states: States, tolerance: float = 0.0) -> float:
+    """Return the largest difference of answers, whose names are for the error.
 
     Args:
         stage: Name of the stage, for the error.
-        what: What is compared, for the error.
         found: What the exported policy gives.
         expected: What it should give.
         states: The inputs, S of them.
@@ -60,17 +56,20 @@ def compare(stage: str, what: str, found: Tensor, expected: Tensor, states: Stat
     Raises:
         GateError: If they differ by more, or are not numbers.
     """
-    if found.shape != expected.shape:
-        raise GateError(f"{stage}: {what} has the shape {list(found.shape)}, not {list(expected.shape)}")
-    difference = (found.double() - expected.double()).abs().nan_to_num(nan=torch.inf)
-    worst = float(difference.max())
-    if worst > tolerance:
-        row = int(difference.max(dim=1).values.argmax())
-        raise GateError(
-            f"{stage}: {what} differs by {worst:.3g} (allowed: {tolerance:g}) at {states.describe(row)}: "
-            f"{found[row].tolist()}, not {expected[row].tolist()}"
-        )
-    return worst
+    worst = [0.0]
+    for what, wanted in expected.items():
+        given = found.get(what, wanted[:, :0])
+        if given.shape != wanted.shape:
+            raise GateError(f"{stage}: {what} has the shape {list(given.shape)}, not {list(wanted.shape)}")
+        difference = (given.double() - wanted.double()).abs().nan_to_num(nan=torch.inf)
+        worst.append(float(difference.max()))
+        if worst[-1] > tolerance:
+            row = int(difference.max(dim=1).values.argmax())
+            raise GateError(
+                f"{stage}: {what} differs by {worst[-1]:.3g} (allowed: {tolerance:g}) at {states.describe(row)}: "
+                f"{given[row].tolist()}, not {wanted[row].tolist()}"
+            )
+    return max(worst)
 
 
 def outputs(function: Function, policy: DeployablePolicy, states: States) -> Answers:
@@ -84,19 +83,8 @@ def answers(form: Any, policy: DeployablePolicy, states: States) -> Answers:
     return _named([*policy.out_keys, ERROR], rows)
 
 
-def _named(names: Sequence[str], rows: Iterable[tuple[Tensor, ...]]) -> Answers:
+def _named(names: Sequence[str], rows: Iterable[Sequence[Tensor]]) -> Answers:
     return {name: torch.cat(column) for name, column in zip(names, zip(*rows, strict=True), strict=True)}
-
-
-def compare_answers(stage: str, found: Answers, expected: Answers, states: States, tolerance: float = 0.0) -> float:
-    """Compare answers, by default to the last bit; return the largest difference.
-
-    Raises:
-        GateError: If a command, a memory or an error differs.
-    """
-    return max(
-        compare(stage, key, found.get(key, part[:, :0]), part, states, tolerance) for key, part in expected.items()
-    )
 
 
 @torch.no_grad()
@@ -126,24 +114,19 @@ def check_against_env(
     met = States({key: rollout.get(key) for key in policy.in_keys})
     for key, view in zip(VIEWS, _views(policy, met), strict=True):
         scale = rollout.get(key).abs().max().clamp(min=1.0)
-        compare(stage, key, view / scale, rollout.get(key) / scale, met, BATCH_TOLERANCE)
+        compare_answers(stage, {key: view / scale}, {key: rollout.get(key) / scale}, met, BATCH_TOLERANCE)
     told = env.simulation.joint_command.of_arrays(
         *(rollout.get(key, rollout.get("joint_position")).numpy() for key in ("action", "joint_position", LAST_COMMAND))
     )
-    acted = (torch.from_numpy(told).float(), rollout.get(NEW_MEMORY, None))
-    for key, answer, expected in zip(policy.out_keys, as_tuple(policy(*met.values())), acted, strict=False):
-        compare(stage, key, answer, expected, met, BATCH_TOLERANCE)
+    acted = dict(zip(policy.out_keys, (torch.from_numpy(told).float(), rollout.get(NEW_MEMORY, None)), strict=False))
+    compare_answers(stage, _named(policy.out_keys, [as_tuple(policy(*met.values()))]), acted, met, BATCH_TOLERANCE)
 
-    see, act = _seeing(env), acting(actor, env)
-    for row in states.rows():
-        seen = see(row)
-        for key, view in zip(VIEWS, _views(policy, row), strict=True):
-            compare(stage, key, view, seen.get(key), row)
-        given = as_tuple(policy(*row.values())), as_tuple(act(*row.values()))
-        for key, answer, expected in zip(policy.out_keys, *given, strict=True):
-            compare(stage, key, answer, expected, row)
-        where = row["joint_position"], row["goal"]
-        compare(stage, ERROR, policy.error(*where), env.simulation.task.module.error(*where), row)
+    see, act, error = _seeing(env), acting(actor, env), env.simulation.task.module.error
+    seen = map(see, states.rows())
+    found = _named(VIEWS, (_views(policy, row) for row in states.rows())) | answers(policy, policy, states)
+    expected = _named(VIEWS, ([one.get(key) for key in VIEWS] for one in seen)) | outputs(act, policy, states)
+    expected[ERROR] = torch.cat([error(row["joint_position"], row["goal"]) for row in states.rows()])
+    compare_answers(stage, found, expected, states)
 
 
 def _views(policy: DeployablePolicy, states: States) -> list[Tensor]:
@@ -166,7 +149,7 @@ def _seeing(env: TransformedRobotEnv) -> Callable[[States], TensorDictBase]:
 def acting(actor: TensorDictModuleBase, env: TransformedRobotEnv) -> Function:
     """The trained policy itself, behind its env's transforms, as a function of what a robot senses."""
     see, memory_size = _seeing(env), getattr(actor, "memory_size", 0)
-    names = [signal.name for signal in input_signals(env.simulation, memory_size)]
+    names = [*(signal.name for signal in env.simulation.sensed), *([MEMORY] if memory_size else [])]
 
     @torch.no_grad()
     def act(*inputs: Tensor) -> tuple[Tensor, ...]:
@@ -183,7 +166,7 @@ def acting(actor: TensorDictModuleBase, env: TransformedRobotEnv) -> Function:
 
 def unroll(function: Function, policy: DeployablePolicy, states: States) -> Answers:
     """Let a policy remember S states, one after the other, from a memory of zeros on."""
-    memory = torch.zeros(1, states.memory_size)
+    memory = torch.zeros_like(states[MEMORY][:1])
 
     def remember(*inputs: Tensor) -> tuple[Tensor, ...]:
         nonlocal memory
@@ -250,14 +233,9 @@ def check_metadata(metadata: Metadata, simulation: Simulation, policy: Deployabl
         GateError: If a part differs; it says which.
     """
     spec, task = simulation.spec, simulation.task
-    true = {
+    of_robot = ("joints", "home", "position_limit", "velocity_limit", "effort_limit", "command_limit")
+    true = {key: getattr(spec, key) for key in of_robot} | {
         "robot": spec.name,
-        "joints": spec.joints,
-        "home": spec.home,
-        "position_limit": spec.position_limit,
-        "velocity_limit": spec.velocity_limit,
-        "effort_limit": spec.effort_limit,
-        "command_limit": spec.command_limit,
         "control_rate": 1.0 / simulation.config.control_dt,
         "inputs": policy.inputs,
         "outputs": policy.outputs,
@@ -324,7 +302,7 @@ def check_drive(
     Raises:
         GateError: If its success rate is not that of the actor on the same goals.
     """
-    driven = evaluate(FileDriver(content, policy, env.simulation.joint_command), env, episodes, seed)
+    driven = drive(content, policy, env, episodes, seed)
     trained = evaluate(actor, env, episodes, seed)
     if abs(driven.success_rate - trained.success_rate) > SUCCESS_TOLERANCE:
         raise GateError(
@@ -334,19 +312,14 @@ def check_drive(
     return driven
 
 
-class FileDriver(TensorDictModuleBase):
-    """A policy file in the place of the actor: sees only what a robot senses, and what it remembers."""
+def drive(content: bytes, policy: DeployablePolicy, env: TransformedRobotEnv, episodes: int, seed: int) -> Evaluation:
+    """Evaluate a TorchScript file in the place of the actor: it sees what a robot senses, and what it remembers."""
+    module, joint_command = load_module(content, policy.in_keys), env.simulation.joint_command
 
-    def __init__(self, content: bytes, policy: DeployablePolicy, joint_command: JointCommand) -> None:
-        super().__init__()
-        self.in_keys = policy.in_keys
-        self.out_keys = ["action", *policy.out_keys[1:]]
-        self.module = load_module(content, self.in_keys)
-        self.joint_command = joint_command
+    def act(*inputs: Tensor) -> tuple[Tensor, ...]:
+        command, *memory = as_tuple(module(*inputs))
+        given = dict(zip(policy.in_keys, inputs, strict=True))
+        return joint_command.action(command, given.get(LAST_COMMAND, command)), *memory
 
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write ``action``, and what is remembered."""
-        command, *memory = as_tuple(self.module(*(tensordict.get(key) for key in self.in_keys)))
-        last_command = tensordict.get(LAST_COMMAND, command)
-        action = self.joint_command.action(command, last_command)
-        return tensordict.update(dict(zip(self.out_keys, (action, *memory), strict=True)))
+    actor = TensorDictModule(act, in_keys=policy.in_keys, out_keys=["action", *policy.out_keys[1:]])
+    return evaluate(actor, env, episodes, seed)

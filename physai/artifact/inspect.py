@@ -85,13 +85,8 @@ def _joints(metadata: Metadata) -> Table:
     table = Table(title="Joints, in the policy's order", title_justify="left")
     for column in ("joint", "position, rad", "velocity, rad/s", "effort, N m", "command, rad/s"):
         table.add_column(column, justify="left" if column == "joint" else "right")
-    columns: tuple[Any, ...] = (
-        metadata.position_limit,
-        metadata.velocity_limit,
-        metadata.effort_limit,
-        metadata.command_limit,
-    )
-    for name, (lower, upper), velocity, effort, command in zip(metadata.joints, *columns, strict=True):
+    limits = (metadata.position_limit, metadata.velocity_limit, metadata.effort_limit, metadata.command_limit)
+    for name, (lower, upper), velocity, effort, command in zip(metadata.joints, *limits, strict=True):
         table.add_row(escape(name), f"{lower:g} to {upper:g}", f"{velocity:g}", f"{effort:g}", f"±{command:g}")
     return table
 

@@ -14,25 +14,10 @@ from torch import Tensor, nn
 from physai.deploy.archive import METADATA
 from physai.deploy.metadata import LAST_COMMAND, MEMORY, NEW_MEMORY
 from physai.envs.make import TransformedRobotEnv
-from physai.envs.simulation import Simulation
 from physai.errors import UserError
-from physai.robots import JointCommand
 from physai.signals import Quantity, Signal
-from physai.tasks import ObservationModule
 
 VIEWS = ("observation", "normalized_observation", "features")  # what a policy can see on a robot
-
-
-def input_signals(simulation: Simulation, memory_size: int = 0) -> tuple[Signal, ...]:
-    """What a policy file takes, in order."""
-    memory = (Signal(MEMORY, Quantity.MEMORY, (memory_size,)),) if memory_size else ()
-    return (*simulation.sensed, *memory)
-
-
-def output_signals(simulation: Simulation, memory_size: int = 0) -> tuple[Signal, ...]:
-    """What it gives, in order."""
-    memory = (Signal(NEW_MEMORY, Quantity.MEMORY, (memory_size,)),) if memory_size else ()
-    return (simulation.spec.joint_command, *memory)
 
 
 class Pipeline(nn.Module):
@@ -42,30 +27,20 @@ class Pipeline(nn.Module):
     and needs no gradients.
 
     Args:
-        observation: The task's observation module.
-        normalizer: Normalizes an observation.
-        network: Makes actions of what it sees.
+        actor: The trained actor; its network makes actions of what it sees.
+        env: The env that it was trained in.
         seen: What the network sees, as places in ``VIEWS``, in order.
-        command: From actions to commands.
         signature: Names of the inputs; pipelines of one type have the same.
     """
 
     __constants__ = ["signature"]  # noqa: RUF012  # which makes a type of its own of each
 
-    def __init__(
-        self,
-        observation: ObservationModule,
-        normalizer: nn.Module,
-        network: nn.Module,
-        seen: list[int],
-        command: JointCommand,
-        signature: str,
-    ) -> None:
+    def __init__(self, actor: Any, env: TransformedRobotEnv, seen: list[int], signature: str) -> None:
         super().__init__()
-        self.observation = copy.deepcopy(observation)
-        self.normalizer = copy.deepcopy(normalizer)
-        self.network = copy.deepcopy(network)
-        self.command = copy.deepcopy(command)
+        self.observation = copy.deepcopy(env.simulation.task.module)
+        self.normalizer = copy.deepcopy(env.normalizer)
+        self.network = copy.deepcopy(actor.deterministic())
+        self.command = copy.deepcopy(env.simulation.joint_command)
         self.seen = seen
         self.signature = signature
         self.requires_grad_(False)
@@ -169,15 +144,13 @@ def make_deployable(actor: TensorDictModuleBase, env: TransformedRobotEnv) -> De
                 f"policy.actor.in_keys: a policy that sees '{key}' cannot be exported, for no robot can tell it; "
                 f"it can see {', '.join(VIEWS)}"
             )
-    inputs, outputs = input_signals(simulation, memory_size), output_signals(simulation, memory_size)
-    pipeline = (RecurrentPipeline if memory_size else FeedForwardPipeline)(
-        simulation.task.module,
-        env.normalizer,
-        actor.deterministic(),
-        [VIEWS.index(key) for key in keys],
-        simulation.joint_command,
-        ", ".join(signal.name for signal in inputs),
-    )
+    inputs = simulation.sensed
+    outputs: tuple[Signal, ...] = (simulation.spec.joint_command,)
+    if memory_size:
+        inputs += (Signal(MEMORY, Quantity.MEMORY, (memory_size,)),)
+        outputs += (Signal(NEW_MEMORY, Quantity.MEMORY, (memory_size,)),)
+    kind = RecurrentPipeline if memory_size else FeedForwardPipeline
+    pipeline = kind(actor, env, [VIEWS.index(key) for key in keys], ", ".join(signal.name for signal in inputs))
     return DeployablePolicy(pipeline, inputs, outputs)
 
 

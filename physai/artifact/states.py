@@ -28,18 +28,9 @@ class States(dict[str, Tensor]):
         """S."""
         return len(next(iter(self.values())))
 
-    @property
-    def memory_size(self) -> int:
-        """H, or 0."""
-        return self[MEMORY].shape[1] if MEMORY in self else 0
-
-    def row(self, index: int) -> "States":
-        """One state, [1, ...] each."""
-        return States({key: value[index : index + 1] for key, value in self.items()})
-
     def rows(self) -> Iterable["States"]:
-        """All states, one by one."""
-        return map(self.row, range(len(self)))
+        """All states, one by one, [1, ...] each."""
+        return (States({key: value[row : row + 1] for key, value in self.items()}) for row in range(len(self)))
 
     def describe(self, index: int) -> str:
         """One state in words; of a long value, the first numbers."""
@@ -58,18 +49,13 @@ def roll_out(actor: TensorDictModuleBase, env: TransformedRobotEnv) -> TensorDic
 def extreme_states(policy: DeployablePolicy, env: TransformedRobotEnv) -> States:
     """Corners of the joint limits, far goals and huge velocities, each with each; memories from empty to full."""
     spec, region = env.simulation.spec, env.simulation.task.region
-    limits = torch.from_numpy(spec.position_limit).clamp(-_TURNS, _TURNS)
-    ends = torch.stack([limits[:, 0], torch.zeros(len(limits)), limits[:, 1]])  # [3, n]
+    low, high = torch.from_numpy(spec.position_limit).clamp(-_TURNS, _TURNS).T
     speed = torch.from_numpy(spec.velocity_limit)
     speeds = [-_FAST * speed, -speed, torch.zeros_like(speed), speed, _FAST * speed]
     drawn = torch.from_numpy(region.sample(4, torch.Generator().manual_seed(0)))
     goals = torch.cat([torch.zeros_like(drawn[:1]), drawn, _FAR * drawn])
     # Corners of all joints would be too many for long arms: all at one end, and one by one.
-    poses = [ends[0], ends[1], ends[2]]
-    for joint, end in itertools.product(range(len(limits)), (0, 2)):
-        pose = ends[1].clone()
-        pose[joint] = ends[end, joint]
-        poses.append(pose)
+    poses = torch.cat([torch.stack([low, torch.zeros_like(low), high]), low.diag(), high.diag()])
     rows = list(itertools.product(poses, speeds, goals))
     sensed = [torch.stack(list(column)).float() for column in zip(*rows, strict=True)]
     states = States(zip(policy.in_keys, sensed, strict=False))

@@ -1,18 +1,19 @@
 """A second opinion: how a policy file drives in an engine that it was not trained in."""
 
 import importlib.util
+from contextlib import closing
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from physai.artifact.gate import FileDriver, GateError
+from physai.artifact.gate import GateError, drive
 from physai.artifact.module import DeployablePolicy
 from physai.compose import compose
 from physai.config import not_installed
 from physai.envs.simulation import EnvConfig, Simulation
 from physai.errors import UserError
-from physai.training.evaluation import MAX_ROBOTS, Evaluation, evaluate
+from physai.training.evaluation import MAX_ROBOTS, Evaluation
 from physai.training.run import TrainedPolicy
 
 LOWEST = 0.97  # success rate in the other engine that a policy must have for certain (lower bound of 95 %)
@@ -80,45 +81,25 @@ class Opinion:
             raise GateError(f"{said}, and {own.success_rate:.1%} in its own; at most {LARGEST_DROP:.0%} may be lost")
 
 
-def ask(
-    content: bytes, policy: DeployablePolicy, trained: TrainedPolicy, physics: dict[str, Any], episodes: int, seed: int
-) -> Opinion:
-    """Let a TorchScript file drive the robots of its run in another engine.
+def ask(content: bytes, policy: DeployablePolicy, trained: TrainedPolicy, episodes: int, seed: int) -> Opinion:
+    """Let a TorchScript file drive the robots of its run in the other engine.
 
     Args:
         content: The file.
         policy: What it was made from.
         trained: The policy of the run.
-        physics: The engine.
         episodes: How many goals.
         seed: Seeds them.
 
     Raises:
-        UserError: If the engine cannot load the robot.
+        UserError: If the engine is not installed, or cannot load the robot.
     """
-    config = trained.config.env
+    config, physics = trained.config.env, other_engine(trained.config.env.physics)
     found = differences(config, physics)
     _, env = trained.deploy(min(episodes, MAX_ROBOTS), seed, config.model_copy(update={"physics": physics}))
-    try:
-        driven = evaluate(FileDriver(content, policy, env.simulation.joint_command), env, episodes, seed)
-    finally:
-        env.close()
+    with closing(env):
+        driven = drive(content, policy, env, episodes, seed)
     return Opinion(physics, driven, found, episodes, trained.randomization.name)
-
-
-@dataclass(frozen=True)
-class _Response:
-    """What n joints do when one of them is told to move, relative to what they do when none is.
-
-    Attributes:
-        moved: [joint told, joint moving], rad, at the end.
-        onset: Control steps until the joint that moves most does so, [n].
-        weak: How far the told joint gets with its effort limit scaled, rad, [scales, n].
-    """
-
-    moved: np.ndarray
-    onset: np.ndarray
-    weak: np.ndarray
 
 
 def differences(config: EnvConfig, other: dict[str, Any]) -> list[str]:
@@ -138,23 +119,25 @@ def differences(config: EnvConfig, other: dict[str, Any]) -> list[str]:
     engines = (
         {key: 0.0 if key == "armature" else value for key, value in one.items()} for one in (config.physics, other)
     )
-    expected, found = (_respond(config.model_copy(update={"physics": engine})) for engine in engines)
+    (own, own_onset, own_weak), (moved, onset, weak) = (
+        _respond(config.model_copy(update={"physics": engine})) for engine in engines
+    )
     joints, lines = config.robot.joints, []
-    moves = np.abs(found.moved).argmax(axis=1)
+    moves = np.abs(moved).argmax(axis=1)
     for told, joint in enumerate(joints):
         if moves[told] != told:
             lines.append(f"a command for {joint} moves {joints[moves[told]]}")
-        elif found.moved[told, told] * expected.moved[told, told] < 0:
+        elif moved[told, told] * own[told, told] < 0:
             lines.append(f"{joint} turns the other way")
     if lines:
         return lines
-    late = int(np.median(found.onset - expected.onset))
+    late = int(np.median(onset - own_onset))
     if abs(late) >= _LATE:
         lines.append(f"commands arrive {abs(late)} control steps {'later' if late > 0 else 'earlier'}")
-    full = np.abs(expected.moved.diagonal())
+    full = np.abs(own.diagonal())
     for number, joint in enumerate(joints):
-        scale = int(np.abs(expected.weak[:, number] / full[number] - 0.5).argmin())  # where the limit is what decides
-        share = float(found.weak[scale, number] / expected.weak[scale, number])
+        scale = int(np.abs(own_weak[:, number] / full[number] - 0.5).argmin())  # where the limit is what decides
+        share = float(weak[scale, number] / own_weak[scale, number])
         if not 0.7 < share < 1.4:
             less = "less" if share < 1 else "more"
             lines.append(
@@ -163,13 +146,20 @@ def differences(config: EnvConfig, other: dict[str, Any]) -> list[str]:
     return lines
 
 
-def _respond(config: EnvConfig) -> _Response:
-    """Rows of the simulation: each joint in turn at each scale of its effort limit; once told to move, once not."""
+def _respond(config: EnvConfig) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Tell each of n joints to move, alone, and see what they do, relative to what they do when none is told to.
+
+    Rows of the simulation: each joint in turn at each scale of its effort limit; once told to move, once not.
+
+    Returns:
+        How far they moved, rad, at the end, [joint told, joint moving]; control steps until the joint that moves most
+        does so, [n]; and how far the told joint gets with its effort limit scaled, rad, [scales, n].
+    """
     joints = len(config.robot.joints)
     rows = joints * len(_SCALES)
     at_home = config.start.model_copy(update={"spread": [0.0] * joints, "carried_over": 0.0})
     simulation = Simulation(config.model_copy(update={"start": at_home}), 2 * rows, seed=0)
-    try:
+    with closing(simulation):
         told = np.tile(np.repeat(np.arange(joints), len(_SCALES)), 2)
         parameters = simulation.physics_parameters.copy()
         effort = simulation.layout.columns["effort_limit"].start + told
@@ -181,11 +171,9 @@ def _respond(config: EnvConfig) -> _Response:
         for _ in range(_STEPS):
             simulation.step(action)
             path.append(simulation.state.joint_position[:rows] - simulation.state.joint_position[rows:])
-    finally:
-        simulation.close()
     path_of = np.stack(path).reshape(_STEPS, joints, len(_SCALES), joints)  # [step, told, scale, moving]
     strong, of_told = path_of[:, :, 0], path_of[:, np.arange(joints), :, np.arange(joints)]  # [told, step, scale]
     most = np.abs(strong[-1]).argmax(axis=1)
     alone = np.abs(strong[:, np.arange(joints), most])  # [step, told]
     step = _SPEED * simulation.spec.command_limit * config.control_dt
-    return _Response(strong[-1], (alone > 0.2 * step).argmax(axis=0), np.abs(of_told[:, -1]).T)
+    return strong[-1], (alone > 0.2 * step).argmax(axis=0), np.abs(of_told[:, -1]).T

@@ -184,13 +184,12 @@ class Controller:
 
     def snapshot(self) -> dict[str, Any]:
         """State, its reasons and counters, for diagnostics; plain values only."""
-        at = self._now if self._now is not None else 0.0
-        known = self._received > -math.inf
+        age = None if self._received == -math.inf else (self._now or 0.0) - self._received
         return {
             "state": self._command.state.value,
             "state_since": self._since,
             "reasons": list(self._command.reasons),
-            "joint_state_age": at - self._received if known else None,
+            "joint_state_age": age,
             "recovery_states_needed": self._needed,
             "last_hold": self._hold_reason,
             "goal": None if self._goal is None else self._goal.tolist(),
@@ -263,11 +262,10 @@ class Controller:
         before, self._received = self._received, robot.received
         silent = self._received - before if before > -math.inf else 0.0
         if silent > self.config.resume_timeout or heard.another is not None:
-            kind = "silent" if heard.another is None else "another source"
-            what = f"the robot was silent for {silent:.1f} s"
-            self._hold(
-                kind, what if heard.another is None else f"'{heard.another}' is told by another source than before"
-            )
+            kind, what = "silent", f"the robot was silent for {silent:.1f} s"
+            if heard.another is not None:
+                kind, what = "another source", f"'{heard.another}' is told by another source than before"
+            self._hold(kind, what)
             if self._goal is not None:
                 self._counters[f"goals forgotten: {kind}"] += 1
                 reasons.append(f"goal forgotten: {self._hold_reason}")

@@ -117,12 +117,14 @@ class Metadata:
         if not joints or not all(isinstance(name, str) for name in joints) or len(set(joints)) != len(joints):
             raise PolicyError("metadata: robot.joints must be distinct names")
         n = len(joints)
-        position = _array(raw, "limits.position", (n, 2), infinite=True)
+        position = _array(raw, "limits.position", (n, 2), null=[-math.inf, math.inf])
         if not (position[:, 0] < position[:, 1]).all():
             raise PolicyError("metadata: limits.position must be pairs of lower and upper limit")
-        inputs, outputs = _signals(raw, "inputs"), _signals(raw, "outputs")
+        inputs = tuple(_signal(raw, key) for key in _items(raw, "inputs", 32, "signals"))
+        outputs = tuple(_signal(raw, key) for key in _items(raw, "outputs", 32, "signals"))
         _check_signals(inputs, outputs, tuple(joints))
-        region, tolerances = _region(raw), _tolerances(raw)
+        tolerances = tuple(_tolerance(raw, key) for key in _items(raw, "goal.tolerances", 1000, "tolerances"))
+        region = _region(raw)
         goal = next(signal for signal in inputs if signal.name == GOAL)
         most = float(np.abs(region.bounds).max())
         if any(each.unit == goal.unit and each.value > most for each in tolerances):
@@ -199,11 +201,12 @@ def _get(raw: dict[str, Any], key: str, kind: type) -> Any:
     return value
 
 
-def _signals(raw: dict[str, Any], side: str) -> tuple[Signal, ...]:
-    listed = _get(raw, side, list)
-    if not 0 < len(listed) <= 32:
-        raise PolicyError(f"metadata: {side} must be a list of signals")
-    return tuple(_signal(raw, f"{side}.{number}") for number in range(len(listed)))
+def _items(raw: dict[str, Any], key: str, most: int, what: str) -> list[str]:
+    """Keys of the items of a list."""
+    count = len(_get(raw, key, list))
+    if not 0 < count <= most:
+        raise PolicyError(f"metadata: {key} must be a list of {what}")
+    return [f"{key}.{number}" for number in range(count)]
 
 
 def _signal(raw: dict[str, Any], key: str) -> Signal:
@@ -218,9 +221,7 @@ def _signal(raw: dict[str, Any], key: str) -> Signal:
     size = math.prod(shape)
     if size > MAX_SIZE:
         raise PolicyError(f"metadata: {key} has {size:,} numbers, more than {MAX_SIZE:,}")
-    low, high = (
-        _bounds(raw, f"{key}.{end}", size, stands_for) for end, stands_for in (("low", -math.inf), ("high", math.inf))
-    )
+    low, high = _bounds(raw, f"{key}.low", size, -math.inf), _bounds(raw, f"{key}.high", size, math.inf)
     labels = _get(raw, f"{key}.labels", list)
     if len(labels) not in (0, size) or not all(isinstance(label, str) for label in labels):
         raise PolicyError(f"metadata: {key}.labels must be {size} names, or none")
@@ -236,11 +237,7 @@ def _signal(raw: dict[str, Any], key: str) -> Signal:
 
 
 def _bounds(raw: dict[str, Any], key: str, size: int, infinite: float) -> tuple[float, ...]:
-    listed = _get(raw, key, list)
-    if not listed:
-        return ()
-    values = _array(raw, key, (size,), nothing=infinite)
-    return tuple(values.tolist())
+    return tuple(_array(raw, key, (size,), null=infinite).tolist()) if _get(raw, key, list) else ()
 
 
 def _check_signals(inputs: tuple[Signal, ...], outputs: tuple[Signal, ...], joints: tuple[str, ...]) -> None:
@@ -287,27 +284,17 @@ def _region(raw: dict[str, Any]) -> Region:
         raise PolicyError(f"metadata: goal.region: {' '.join(str(error).split())[:120]}") from error
 
 
-def _tolerances(raw: dict[str, Any]) -> tuple[Tolerance, ...]:
-    listed = _get(raw, "goal.tolerances", list)
-    if not 0 < len(listed) <= 1000:
-        raise PolicyError("metadata: goal.tolerances must be a list of tolerances")
-    return tuple(
-        Tolerance(
-            _get(raw, f"goal.tolerances.{number}.name", str),
-            _get(raw, f"goal.tolerances.{number}.unit", str),
-            float(_positive(raw, f"goal.tolerances.{number}.value", ())),
-        )
-        for number in range(len(listed))
-    )
+def _tolerance(raw: dict[str, Any], key: str) -> Tolerance:
+    name, unit = _get(raw, f"{key}.name", str), _get(raw, f"{key}.unit", str)
+    return Tolerance(name, unit, float(_positive(raw, f"{key}.value", ())))
 
 
 def _array(
     raw: dict[str, Any],
     key: str,
     shape: tuple[int, ...],
-    infinite: bool = False,
     kind: type = np.float64,
-    nothing: float | None = None,
+    null: float | list[float] | None = None,  # what null stands for: JSON has no infinity
 ) -> np.ndarray:
     value = _get(raw, key, object)
     try:
@@ -319,11 +306,9 @@ def _array(
         raise PolicyError(f"metadata: {key} must hold numbers") from error
     if array.shape != shape:
         raise PolicyError(f"metadata: {key} must have the shape {list(shape)}, not {list(array.shape)}")
-    if infinite:  # JSON has no infinity: null stands for a limit that does not exist
-        array = np.where(np.isnan(array), np.array([-math.inf, math.inf]), array)
-    elif nothing is not None:
-        array = np.where(np.isnan(array), nothing, array)
-    elif not np.isfinite(array).all():
+    if null is not None:
+        return np.where(np.isnan(array), null, array)
+    if not np.isfinite(array).all():
         raise PolicyError(f"metadata: {key} must be finite")
     return array
 

@@ -3,9 +3,12 @@
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import matplotlib
 import numpy as np
 import torch
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+from matplotlib.patches import Annulus, Circle
 from omegaconf import DictConfig
 
 from physai.config import validate
@@ -13,13 +16,6 @@ from physai.deploy import Policy
 from physai.envs.simulation import EnvConfig
 from physai.robots import ForwardKinematics, RobotSpec
 from physai.signals import Quantity, Ring
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
-from matplotlib.axes import Axes
-from matplotlib.collections import LineCollection
-from matplotlib.figure import Figure
-from matplotlib.patches import Annulus, Circle
 
 if TYPE_CHECKING:
     from physai.ros.driving.goal_client import Record
@@ -33,11 +29,11 @@ def draw_drive(record: "Record", policy: Policy, output: Path) -> None:
         policy: The policy that drove.
         output: The PNG to write.
     """
-    figure, (above, over) = plt.subplots(1, 2, figsize=(12, 5.4), layout="constrained", width_ratios=[1, 1.25])
+    figure = Figure(figsize=(12, 5.4), layout="constrained")
+    above, over = figure.subplots(1, 2, width_ratios=[1, 1.25])
     _draw_path(figure, above, record, policy)
     _draw_errors(over, record, policy)
     figure.savefig(output, dpi=120)
-    plt.close(figure)
 
 
 def _draw_path(figure: Figure, axes: Axes, record: "Record", policy: Policy) -> None:

@@ -3,15 +3,14 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-import matplotlib
 import numpy as np
 import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import EngFormatter
 
 from physai import foreign
 from physai.errors import UserError
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
 
 _BINS = 60
 
@@ -32,7 +31,8 @@ def plot_runs(runs: Sequence[Path], output: Path) -> None:
     groups: dict[str, list[pd.DataFrame]] = {}
     for run in runs:
         groups.setdefault(_label(run), []).append(_episodes(run))
-    figure, axes = plt.subplots(1, 3, figsize=(15, 4.2), layout="constrained")
+    figure = Figure(figsize=(15, 4.2), layout="constrained")
+    axes = figure.subplots(1, 3)
     for label, members in groups.items():
         _curve(axes[0], members, "return", label)
         _curve(axes[1], members, "length", label)
@@ -45,13 +45,12 @@ def plot_runs(runs: Sequence[Path], output: Path) -> None:
         axis.set_title(title)
         axis.set_xlabel("frames")
         axis.grid(alpha=0.25)
-        axis.xaxis.set_major_formatter(matplotlib.ticker.EngFormatter(sep=""))
+        axis.xaxis.set_major_formatter(EngFormatter(sep=""))
         axis.spines[["top", "right"]].set_visible(False)
     handles, labels = axes[0].get_legend_handles_labels()
     columns = max(1, min(3, 120 // max(map(len, labels), default=1)))  # what fits beside each other
     figure.legend(handles, labels, loc="outside lower center", ncols=min(columns, len(labels)), frameon=False)
     figure.savefig(output, dpi=130)
-    plt.close(figure)
 
 
 def _episodes(run: Path) -> pd.DataFrame:
@@ -68,7 +67,7 @@ def _episodes(run: Path) -> pd.DataFrame:
     return episodes
 
 
-def _rates(axis: plt.Axes, run: Path, color: str) -> None:
+def _rates(axis: Axes, run: Path, color: str) -> None:
     """What the evaluations while training found; a run may not have had one yet."""
     path = run / "metrics.csv"
     if not path.is_file():
@@ -90,7 +89,7 @@ def _label(run: Path) -> str:
     return ", ".join([foreign.read_name(run), *rest])
 
 
-def _curve(axis: plt.Axes, members: list[pd.DataFrame], column: str, label: str) -> None:
+def _curve(axis: Axes, members: list[pd.DataFrame], column: str, label: str) -> None:
     edges = np.linspace(0, max(episodes["frame"].max() for episodes in members), _BINS + 1)
     centers = (edges[1:] + edges[:-1]) / 2
     binned = [episodes.groupby(pd.cut(episodes["frame"], edges), observed=False)[column] for episodes in members]

@@ -4,11 +4,12 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import matplotlib
 import numpy as np
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
+from matplotlib.axes import Axes
+from matplotlib.collections import QuadMesh
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Rectangle
 
 if TYPE_CHECKING:
     from physai.stress.run import Map
@@ -33,9 +34,8 @@ def plot_maps(maps: "Mapping[str, Map]", output: Path) -> None:
         maps: By the name of the run.
         output: The PNG to write.
     """
-    figure, axes = plt.subplots(
-        len(maps), 2, figsize=(11, 0.6 + 4.2 * len(maps)), layout="constrained", squeeze=False, sharex=True, sharey=True
-    )
+    figure = Figure(figsize=(11, 0.6 + 4.2 * len(maps)), layout="constrained")
+    axes = figure.subplots(len(maps), 2, squeeze=False, sharex=True, sharey=True)
     for row, (run, found) in zip(axes, maps.items(), strict=True):
         for axis, what in zip(row, ("success", "settled"), strict=True):
             mesh = _heat(axis, found, 100 * getattr(found, what) / found.episodes)
@@ -45,15 +45,14 @@ def plot_maps(maps: "Mapping[str, Map]", output: Path) -> None:
         axis.set_xlabel(_label(found.x.name, found.x.operation))
     figure.colorbar(mesh, ax=axes, label="% of goals", shrink=0.9)
     handles = [
-        plt.Line2D([], [], color="black", linewidth=2, label="95 % work"),
-        plt.Line2D([], [], color="crimson", linewidth=2, linestyle="--", label="range of the training"),
+        Line2D([], [], color="black", linewidth=2, label="95 % work"),
+        Line2D([], [], color="crimson", linewidth=2, linestyle="--", label="range of the training"),
     ]
     figure.legend(handles=handles, loc="outside lower center", ncols=2, frameon=False)
     figure.savefig(output, dpi=130)
-    plt.close(figure)
 
 
-def _heat(axis: plt.Axes, found: "Map", percent: np.ndarray) -> matplotlib.collections.QuadMesh:
+def _heat(axis: Axes, found: "Map", percent: np.ndarray) -> QuadMesh:
     columns, rows = np.arange(len(found.x_values)), np.arange(len(found.y_values))
     mesh = axis.pcolormesh(columns, rows, percent, cmap="viridis", vmin=0, vmax=100)
     for (row, column), value in np.ndenumerate(percent):
@@ -66,7 +65,7 @@ def _heat(axis: plt.Axes, found: "Map", percent: np.ndarray) -> matplotlib.colle
         for trained, values in zip(found.trained, (found.x_values, found.y_values), strict=True)
     )
     size = right - left, top - bottom
-    axis.add_patch(plt.Rectangle((left, bottom), *size, fill=False, edgecolor="crimson", linewidth=2, linestyle="--"))
+    axis.add_patch(Rectangle((left, bottom), *size, fill=False, edgecolor="crimson", linewidth=2, linestyle="--"))
     axis.set_xticks(columns, [f"{value:.3g}" for value in found.x_values])
     axis.set_yticks(rows, [f"{value:.3g}" for value in found.y_values])
     return mesh

@@ -4,11 +4,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import matplotlib
 import numpy as np
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 
 def plot_study(trials: Any, objective: str, minimize: bool, names: Mapping[str, str], output: Path) -> None:
@@ -23,7 +21,8 @@ def plot_study(trials: Any, objective: str, minimize: bool, names: Mapping[str, 
     """
     ended = trials[np.isfinite(trials[objective].astype(float))]
     best = ended[objective].cummin() if minimize else ended[objective].cummax()
-    figure, (left, right) = plt.subplots(1, 2, figsize=(11, 4.2), layout="constrained")
+    figure = Figure(figsize=(11, 4.2), layout="constrained")
+    left, right = figure.subplots(1, 2)
     left.scatter(ended["run"], ended[objective], s=22, alpha=0.7, label="trials")
     left.step(ended["run"], best, where="post", linewidth=2, color="tab:orange", label="best so far")
     lost = trials["run"].drop(ended.index)
@@ -31,7 +30,7 @@ def plot_study(trials: Any, objective: str, minimize: bool, names: Mapping[str, 
               label="no value")  # fmt: skip
     left.set_title(objective.capitalize())
     left.set_xlabel("trial")
-    left.xaxis.set_major_locator(matplotlib.ticker.MaxNLocator(integer=True))
+    left.xaxis.set_major_locator(MaxNLocator(integer=True))
     left.legend(frameon=False)
     ranks = ended[[objective, *names]].rank(numeric_only=True)
     columns = [key for key in names if key in ranks and ranks[key].nunique() > 1]
@@ -44,4 +43,3 @@ def plot_study(trials: Any, objective: str, minimize: bool, names: Mapping[str, 
         axis.grid(alpha=0.25)
         axis.spines[["top", "right"]].set_visible(False)
     figure.savefig(output, dpi=130)
-    plt.close(figure)

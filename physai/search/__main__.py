@@ -70,8 +70,8 @@ class Search:
         try:
             if done := study.done():
                 print(f"{folder}: {done} trials are done, {max(0, settings.trials - done)} are left.", flush=True)
-            with Report(folder, study, settings.trials) as report:
-                run_trials(folder, study, self._config, self._fixed, report.ended)
+            report = Report(folder, study)
+            run_trials(folder, study, self._config, self._fixed, report.ended)
             report.summary(self._fixed)
         except KeyboardInterrupt:
             print(f"\nInterrupted; go on with the same command and hydra.run.dir={folder}")

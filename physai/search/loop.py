@@ -34,7 +34,8 @@ def run_trials(
             while len(running) < min(settings.jobs, settings.trials - study.done()):
                 run, trial = study.ask()
                 values = ["export.formats=[]", *fixed, *overrides(trial.params)]  # of many trials, few are for a robot
-                running.append(_Running(run, trial, folder / str(run), values, config))
+                step = study.trials()[run].last_step  # of a trial that goes on
+                running.append(_Running(run, trial, -1 if step is None else step, folder / str(run), values, config))
             if not running:
                 return
             wait([one.process.sentinel for one in running], _POLL)
@@ -54,12 +55,14 @@ def run_trials(
 
 
 class _Running:
-    """A trial that runs."""
+    """A trial that runs; its evaluations up to a ``step`` have been reported."""
 
-    def __init__(self, run: int, trial: Trial, folder: Path, values: Sequence[str], config: SearchConfig) -> None:
+    def __init__(
+        self, run: int, trial: Trial, step: int, folder: Path, values: Sequence[str], config: SearchConfig
+    ) -> None:
         self.run, self._trial, self._folder, self._settings = run, trial, folder, config.search
         self._every_frames = config.evaluation.every_frames
-        self._step = -1
+        self._step = step
         self._pruned = self._reached = False
         self.process = trials.start(folder, values)
 
@@ -67,9 +70,9 @@ class _Running:
         """Report new evaluations, and stop the run if they are worse than the median of the others' at that step."""
         for one in trials.evaluations(self._folder):
             step = one.frames // self._every_frames
+            self._reached |= self._settings.minimize and one.success_rate >= self._settings.target
             if step > self._step:
                 self._step = step
-                self._reached |= self._settings.minimize and one.success_rate >= self._settings.target
                 self._trial.report(-one.success_rate if self._settings.minimize else one.success_rate, step)
                 if self._settings.prune and not (self._pruned or self._reached) and self._trial.should_prune():
                     self._pruned = True

@@ -1,4 +1,4 @@
-"""What a search shows: how far it is, a line for each trial, and in the end the best of them."""
+"""What a search shows: a line for each trial, and in the end the best of them."""
 
 import math
 import shlex
@@ -10,7 +10,6 @@ from typing import Any
 import pandas
 from rich.console import Console
 from rich.markup import escape
-from rich.progress import Progress
 from rich.table import Table
 
 from physai import cli
@@ -21,27 +20,17 @@ _BEST = 10
 
 
 class Report:
-    """A progress bar on a terminal, and a line for each trial that has ended; a context.
+    """A line for each trial that has ended, and a summary of all.
 
     Args:
         folder: The study's.
         study: It.
-        trials: How many there will be.
     """
 
-    def __init__(self, folder: Path, study: Study, trials: int) -> None:
+    def __init__(self, folder: Path, study: Study) -> None:
         self._folder, self._study = folder, study
         self._objective = "seconds to target" if study.minimize else "success rate"
         self._names = _short_names(study.space)
-        self._progress = Progress(disable=not sys.stdout.isatty())
-        self._task = self._progress.add_task("searching", total=trials, completed=study.done())
-
-    def __enter__(self) -> "Report":
-        self._progress.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._progress.stop()
 
     def ended(self, run: int) -> None:
         """Show what became of a run."""
@@ -52,7 +41,6 @@ class Report:
             "FAIL": f"failed: {trial.user_attrs.get('error')}",
         }[trial.state.name]
         values = " ".join(f"{self._names[key]}={_short(value)}" for key, value in trial.params.items())
-        self._progress.update(self._task, completed=self._study.done())
         print(cli.printable(f"[{run}] {result}  ({values})"), flush=True)
 
     def summary(self, fixed: Sequence[str]) -> None:

@@ -1,15 +1,13 @@
 """The study: which values were tried, what came of them, and what is tried next.
 
 Only this process writes to it; ``study.log`` is Optuna's journal, a line for each thing that happened. A trial is known
-by its run, the name of its folder: a run that was interrupted with its search is tried again, as another trial of
-Optuna's, in the same folder.
+by its run, its number among those whose values were all drawn, and the name of its folder. One that runs when its
+search is interrupted stays as it is in the journal, and goes on with the search.
 """
 
 import contextlib
 import fcntl
-import itertools
 import os
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -57,7 +55,7 @@ class Study:
                 _create(path, about, minimize)
             self._study = _load(path, about, space)
             _repair(path)
-            self._go_on()
+            self._interrupted = [run for run, one in self.trials().items() if one.state is TrialState.RUNNING]
         except BaseException as error:
             self.close()
             if isinstance(error, BlockingIOError):
@@ -69,18 +67,21 @@ class Study:
         os.close(self._folder)
 
     def trials(self) -> dict[int, FrozenTrial]:
-        """The last trial of each run, by the run's number."""
-        return dict(_runs(self._study.get_trials(deepcopy=False)))
+        """The trial of each run, by its number; one whose values were not all drawn, because of a kill, is none."""
+        trials = self._study.get_trials(deepcopy=False)
+        return dict(enumerate(trial for trial in trials if trial.params.keys() == self.space.keys()))
 
     def done(self) -> int:
         """How many runs have come to an end by themselves, or were pruned."""
         return sum(trial.state.is_finished() for trial in self.trials().values())
 
     def ask(self) -> tuple[int, Trial]:
-        """Begin a trial, first those that were interrupted; return the number of its run, and itself."""
-        trials = self._study.get_trials(deepcopy=False)
-        waiting = [run for run, trial in _runs(trials) if trial.state is TrialState.WAITING]
-        run = waiting[0] if waiting else sum("run" not in trial.user_attrs for trial in trials)
+        """Begin a trial, or go on with one that was interrupted; return the number of its run, and itself."""
+        trials = self.trials()
+        if self._interrupted:
+            run = self._interrupted.pop(0)
+            return run, Trial(self._study, trials[run]._trial_id)
+        run = len(trials)
         # Its values follow from the run and what came before, however often the search was interrupted.
         self._study.sampler = TPESampler(seed=derive(self._seed, "search", run) % 2**32)
         return run, self._study.ask(self.space)
@@ -94,25 +95,6 @@ class Study:
             self._study.tell(trial, value)
         else:
             self._study.tell(trial, state=TrialState.PRUNED)
-
-    def _go_on(self) -> None:
-        """End the trials that were running when the search was interrupted, and try their runs again."""
-        runs = list(_runs(self._study.get_trials()))
-        waiting = {run for run, trial in runs if trial.state is TrialState.WAITING}
-        for run, trial in runs:
-            if trial.state is TrialState.RUNNING:
-                values = trial.system_attrs.get("fixed_params") or trial.params
-                if len(values) < len(self.space):  # it was interrupted while they were drawn
-                    values = {}
-                if "error" not in trial.user_attrs and run not in waiting:
-                    self._study.enqueue_trial(values, user_attrs={"run": run})
-                self._study.tell(trial.number, state=TrialState.FAIL)
-
-
-def _runs(trials: Sequence[FrozenTrial]) -> list[tuple[int, FrozenTrial]]:
-    """Each trial with the number of its run: trials that try a run again say its number, the others count on."""
-    count = itertools.count()
-    return [(trial.user_attrs["run"] if "run" in trial.user_attrs else next(count), trial) for trial in trials]
 
 
 def _create(path: Path, about: dict[str, Any], minimize: bool) -> None:
@@ -140,17 +122,15 @@ def _load(path: Path, about: dict[str, Any], space: Space) -> optuna.Study:
     except Exception as error:  # whatever Optuna makes of a file of anyone's
         reason = (str(error) or type(error).__name__).splitlines()[0]
         raise UserError(f"{path}: no study can be read there: {reason}") from error
-    if found != about or not all(_is_ours(trial, space, len(trials)) for trial in trials):
+    if found != about or not all(_is_ours(trial, space) for trial in trials):
         raise UserError(f"{path.parent} holds a study of something else: choose another hydra.run.dir")
     return study
 
 
-def _is_ours(trial: FrozenTrial, space: Space, trials: int) -> bool:
-    """Whether a trial names nothing but what is searched: its values become overrides, its run a folder."""
-    run = trial.user_attrs.get("run", 0)
-    values = trial.system_attrs.get("fixed_params", {})
+def _is_ours(trial: FrozenTrial, space: Space) -> bool:
+    """Whether a trial names nothing but what is searched, and was not enqueued: its values become overrides."""
     known: dict[str, BaseDistribution] = {key: space[key] for key in trial.distributions if key in space}
-    return type(run) is int and 0 <= run < trials and trial.distributions == known and values.keys() <= space.keys()
+    return trial.distributions == known and "fixed_params" not in trial.system_attrs
 
 
 def _repair(path: Path) -> None:

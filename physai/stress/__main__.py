@@ -1,30 +1,26 @@
 """``python -m physai.stress``: find out where a policy stops to work (see ``--help``)."""
 
+import contextlib
 import json
-import sys
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 from omegaconf import DictConfig
 from pydantic import Field
 from rich.console import Console
-from rich.progress import Progress
 from rich.table import Table
 
 from physai import cli
-from physai.config import Config, Count, PackageName, Seed, validate
+from physai.config import Count, Seed, validate
 from physai.errors import UserError
 from physai.evaluate import PolicyChoice
 from physai.files import write_atomically
 from physai.stress.axes import Axis, AxisConfig
-from physai.stress.run import Map, StressTest
+from physai.stress.run import Breaks, Map, StressTest
 from physai.training.run import TrainedPolicy
 
-Breaks = dict[str, dict[str, list[float | None]]]
-"""By axis, for ``success`` and ``settled``: the last values that work, towards the low and the high end."""
 
-
-class StressConfig(Config):
+class StressConfig(PolicyChoice):
     """``conf/stress.yaml``."""
 
     run: str | Annotated[list[str], Field(min_length=1)]
@@ -34,11 +30,6 @@ class StressConfig(Config):
     episodes: Count
     breaks: bool
     output: str | None
-    allow: list[PackageName]
-    env: dict[str, Any] | None
-    physics: dict[str, Any] | None
-    randomization: dict[str, Any] | None
-    checkpoint: str | int
     seed: Seed
     axes: dict[str, AxisConfig]
 
@@ -46,11 +37,6 @@ class StressConfig(Config):
     def runs(self) -> list[str]:
         """The run folders."""
         return [self.run] if isinstance(self.run, str) else self.run
-
-    def load(self, run: str) -> TrainedPolicy:
-        """The policy of one of them."""
-        same = {name: getattr(self, name) for name in PolicyChoice.model_fields if name != "run"}
-        return PolicyChoice(run=run, **same).load()
 
     def axis(self, name: str, policy: TrainedPolicy) -> Axis:
         """An axis, for the robots of a policy."""
@@ -60,11 +46,8 @@ class StressConfig(Config):
         """All axes that the robots of a policy have."""
         found = []
         for name in self.axes:
-            try:
+            with contextlib.suppress(UserError):
                 found.append(self.axis(name, policy))
-            except UserError:
-                if name in (self.x, self.y):
-                    raise
         return found
 
 
@@ -90,8 +73,10 @@ def _stress(node: DictConfig, _: Path) -> None:
     name = f"stress_{config.x}_{config.y}"
     for run in config.runs:
         policy = config.load(run)
-        found, breaks = _try(config, policy, run)
-        maps[run] = found
+        x, y = (config.axis(axis, policy) for axis in (config.x, config.y))
+        with StressTest(policy, config.episodes, config.seed, run) as test:
+            found = maps[run] = test.map(x, y, config.grid)
+            breaks = test.breaks(config.others(policy)) if config.breaks else {}
         summary = {
             "run": run,
             "checkpoint": config.checkpoint,
@@ -109,24 +94,6 @@ def _stress(node: DictConfig, _: Path) -> None:
     output = Path(config.output or (Path(config.runs[0]) if len(maps) == 1 else Path()) / f"{name}.png")
     plot_maps(maps, output)
     print(f"Map: {output}; figures: {', '.join(str(Path(run) / name) + '.json' for run in maps)}")
-
-
-def _try(config: StressConfig, policy: TrainedPolicy, run: str) -> tuple[Map, Breaks]:
-    x, y = (config.axis(name, policy) for name in (config.x, config.y))
-    breaks: Breaks = {}
-    bar = Progress(disable=not sys.stdout.isatty())
-    with StressTest(policy, config.episodes, config.seed) as test, bar:
-        task = bar.add_task(f"{run}: map", total=len(x.values(config.grid)) * len(y.values(config.grid)))
-        result = test.map(x, y, config.grid, lambda: bar.advance(task))
-        if config.breaks:
-            axes = config.others(policy)
-            task = bar.add_task(f"{run}: break values", total=2 * len(axes))
-            for axis, end, found in test.breaks(axes):
-                for what, value in found.items():
-                    breaks.setdefault(axis.name, {}).setdefault(what, [None, None])[end] = value
-                bar.advance(task)
-            bar.update(task, completed=2 * len(axes))
-    return result, {axis: breaks[axis] for axis in config.axes if axis in breaks}
 
 
 def _show(run: str, breaks: Breaks, config: StressConfig, policy: TrainedPolicy) -> None:

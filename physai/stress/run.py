@@ -1,21 +1,25 @@
 """A whole stress test: the cells of a map and the break values, on all cores."""
 
-import contextlib
 import multiprocessing
 import os
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor, as_completed
+import sys
+from collections.abc import Iterable, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
+from rich.progress import track
 
 from physai import processes
 from physai.stress.axes import Axis
 from physai.stress.trial import Count, Setting, Trial
 from physai.training.evaluation import wilson
 from physai.training.run import TrainedPolicy
+
+Breaks = dict[str, dict[str, list[float | None]]]
+"""By axis, for ``success`` and ``settled``: the last values that work, towards the low and the high end."""
 
 _trial: Trial | None = None  # of a worker
 
@@ -46,18 +50,17 @@ class Map:
 
     def summary(self) -> dict[str, Any]:
         """The map for a file: counts, and 95 % intervals of the rates."""
-        axes = (self.x, self.x_values, self.trained[0]), (self.y, self.y_values, self.trained[1])
-        described = [
-            {"name": axis.name, "operation": axis.operation, "values": values.tolist(), "trained": list(trained)}
-            for axis, values, trained in axes
-        ]
+        axes = {"x": (self.x, self.x_values, self.trained[0]), "y": (self.y, self.y_values, self.trained[1])}
+        described = {
+            key: {"name": axis.name, "operation": axis.operation, "values": values.tolist(), "trained": list(trained)}
+            for key, (axis, values, trained) in axes.items()
+        }
         intervals = {
             what: [[wilson(torch.arange(self.episodes) < count) for count in row] for row in getattr(self, what)]
             for what in ("success", "settled")
         }
         return {
-            "x": described[0],
-            "y": described[1],
+            **described,
             "episodes": self.episodes,
             **{what: {"count": getattr(self, what).tolist(), "ci": ci} for what, ci in intervals.items()},
         }
@@ -70,53 +73,43 @@ class StressTest:
         policy: The policy of a run.
         episodes: Of each cell, and of each value that is tried for a break.
         seed: Seeds goals, starts, and draws, the same for every value.
+        name: Of the policy, for those who wait.
     """
 
-    def __init__(self, policy: TrainedPolicy, episodes: int, seed: int) -> None:
-        self._policy, self._episodes, self._seed = policy, episodes, seed
-        self._stack = contextlib.ExitStack()
+    def __init__(self, policy: TrainedPolicy, episodes: int, seed: int, name: str = "") -> None:
+        self._policy, self._episodes, self._name = policy, episodes, name
+        worker = (os.getpid(), policy, episodes, seed)
+        context = multiprocessing.get_context("fork")
+        self._pool = ProcessPoolExecutor(len(os.sched_getaffinity(0)), context, _begin, worker)
 
     def __enter__(self) -> "StressTest":
-        pool = ProcessPoolExecutor(
-            len(os.sched_getaffinity(0)),
-            multiprocessing.get_context("fork"),
-            _begin,
-            (os.getpid(), self._policy, self._episodes, self._seed),
-        )
-        self._pool = pool
-        self._stack.callback(pool.shutdown, cancel_futures=True)
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._stack.close()
+        self._pool.shutdown(cancel_futures=True)
 
-    def map(self, x: Axis, y: Axis, grid: int, advance: Callable[[], object] = lambda: None) -> Map:
-        """Try a grid of values; ``advance`` is called for each cell that is done."""
+    def map(self, x: Axis, y: Axis, grid: int) -> Map:
+        """Try a grid of values."""
         x_values, y_values = x.values(grid), y.values(grid)
-        cells = {
-            self._pool.submit(_count, [(x, float(x_value)), (y, float(y_value))]): (row, column)
-            for row, y_value in enumerate(y_values)
-            for column, x_value in enumerate(x_values)
-        }
-        success, settled = np.zeros((2, len(y_values), len(x_values)), int)
-        for future in as_completed(cells):
-            found, cell = future.result(), cells[future]
-            success[cell], settled[cell] = found.success, found.settled
-            advance()
+        cells = [[(x, float(x_value)), (y, float(y_value))] for y_value in y_values for x_value in x_values]
+        counts = self._shown("map", self._pool.map(_count, cells), len(cells))
+        success, settled = np.array(list(counts)).T.reshape(2, len(y_values), -1)
         config, randomization = self._policy.config.env, self._policy.config.randomization
         trained = x.trained(randomization, config), y.trained(randomization, config)
         return Map(x, y, x_values, y_values, success, settled, self._episodes, trained)
 
-    def breaks(self, axes: Sequence[Axis]) -> Iterator[tuple[Axis, int, dict[str, float | None]]]:
-        """Look for the break values of each axis alone; yield axis, end (0 is low, 1 is high) and what was found."""
-        config = self._policy.config.env
-        tasks: dict[Future[dict[str, float | None]], tuple[Axis, int]] = {}
-        for axis in axes:
-            for number, end in enumerate((axis.low, axis.high)):
-                if end != axis.nominal(config):
-                    tasks[self._pool.submit(_breaks, axis, end)] = axis, number
-        for future in as_completed(tasks):
-            yield *tasks[future], future.result()
+    def breaks(self, axes: Sequence[Axis]) -> Breaks:
+        """Look for the break values of each axis alone."""
+        tasks = [(axis, end) for axis in axes for end in (axis.low, axis.high)]
+        found = list(self._shown("break values", self._pool.map(_breaks, *zip(*tasks, strict=True)), len(tasks)))
+        return {
+            axis.name: {what: [low[what], high[what]] for what in low}
+            for axis, low, high in zip(axes, found[::2], found[1::2], strict=True)
+        }
+
+    def _shown(self, what: str, results: Iterable[Any], total: int) -> Iterable[Any]:
+        """The results as they come, with a bar on a terminal."""
+        return track(results, f"{self._name}: {what}", total, disable=not sys.stdout.isatty())
 
 
 def _begin(parent: int, policy: TrainedPolicy, episodes: int, seed: int) -> None:

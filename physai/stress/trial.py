@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 from tensordict.nn import TensorDictModuleBase
@@ -22,8 +23,7 @@ Setting = tuple[Axis, float]
 """An axis, and the value that all robots have there."""
 
 
-@dataclass(frozen=True)
-class Count:
+class Count(NamedTuple):
     """How many of so many episodes succeeded, and how many settled."""
 
     success: int
@@ -77,9 +77,11 @@ class Trial:
 
         Returns:
             The last value found at which the policy still works, for ``success`` and ``settled``: that of the robot as
-            described where it works nowhere, None where it works up to the end.
+            described where it works nowhere, None where it works up to the end, or where there is nothing in between.
         """
         nominal, known = axis.nominal(self.policy.config.env), dict[float, Count]()
+        if end == nominal:
+            return {"success": None, "settled": None}
 
         def works(value: float, what: str) -> bool:
             if value not in known:

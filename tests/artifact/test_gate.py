@@ -263,10 +263,10 @@ def test_a_number_that_is_not_finite_is_a_difference(trained):
     found = expected.clone()
     found[4, 1] = torch.nan
     with pytest.raises(gate.GateError, match="stage: command differs by inf") as refused:
-        gate.compare("stage", "command", found, expected, states, tolerance=1.0)
+        gate.compare_answers("stage", {"command": found}, {"command": expected}, states, tolerance=1.0)
     assert states.describe(4) in str(refused.value)
     with pytest.raises(gate.GateError, match=r"shape \[3, 2\]"):
-        gate.compare("stage", "command", expected[:3], expected, states)
+        gate.compare_answers("stage", {"command": expected[:3]}, {"command": expected}, states)
 
 
 @pytest.mark.slow

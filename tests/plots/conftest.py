@@ -1,13 +1,14 @@
 """Figures that a test can look into."""
 
-import matplotlib.pyplot as plt
 import pytest
+from matplotlib.figure import Figure
 
 
 @pytest.fixture
 def drawn(monkeypatch):
-    """The figures that were drawn, left open."""
-    monkeypatch.setattr(plt, "close", lambda _: None)
-    yield plt.gcf
-    monkeypatch.undo()
-    plt.close("all")
+    """The figure that was drawn last."""
+    figures, save = [], Figure.savefig
+    monkeypatch.setattr(
+        Figure, "savefig", lambda figure, *args, **kw: (figures.append(figure), save(figure, *args, **kw))
+    )
+    return lambda: figures[-1]

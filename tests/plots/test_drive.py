@@ -4,6 +4,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from matplotlib.colors import to_rgb
 
 from physai.deploy import load_policy
 from physai.plots import drive
@@ -21,7 +22,7 @@ def test_a_drive_shows_each_goal_in_the_colour_of_its_end_and_the_errors_over_ti
     drive.draw_drive(record, policy, tmp_path / "drive.png")
     assert (tmp_path / "drive.png").read_bytes().startswith(b"\x89PNG")
     above, over, _ = drawn().axes
-    green, red = (drive.matplotlib.colors.to_rgb(name) for name in ("tab:green", "tab:red"))
+    green, red = (to_rgb(name) for name in ("tab:green", "tab:red"))
     goals = [patch for patch in above.patches if isinstance(patch, drive.Circle)]
     assert [tuple(patch.center) for patch in goals] == [(0.3, 0.2), (-0.2, 0.3)]
     assert [patch.get_facecolor()[:3] for patch in goals] == [green, red]

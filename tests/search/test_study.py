@@ -69,6 +69,7 @@ def test_values_that_were_not_all_taken_again_when_the_search_was_killed_are_tak
     with opened(tmp_path) as study:
         run, trial = study.ask()
         assert (run, trial.params) == (0, params)
+        assert study.ask()[0] == 1
 
 
 def test_trials_that_were_interrupted_are_tried_again_and_those_that_ended_are_not(tmp_path):
@@ -77,23 +78,16 @@ def test_trials_that_were_interrupted_are_tried_again_and_those_that_ended_are_n
         study.tell(trials[0], 0.5)
         study.tell(trials[1], error="the loss is not finite")
         study.tell(trials[2])
+        trials[3].report(0.25, 2)
     with opened(tmp_path) as study:
         assert study.done() == 3
+        assert study.trials()[3].last_step == 2
         run, again = study.ask()
         assert (run, again.params) == (3, trials[3].params)
         assert study.ask()[0] == 4
         assert [trial.state.name for trial in study.trials().values()] == [
             "COMPLETE", "FAIL", "PRUNED", "RUNNING", "RUNNING",
         ]  # fmt: skip
-
-
-def test_a_kill_between_enqueueing_and_telling_repeats_nothing_twice(tmp_path):
-    with opened(tmp_path) as study:
-        _, trial = study.ask()
-        study._study.enqueue_trial(trial.params, user_attrs={"run": 0})
-    with opened(tmp_path) as study:
-        assert study.ask()[0] == 0
-        assert study.ask()[0] == 1
 
 
 @pytest.mark.parametrize(
@@ -170,7 +164,7 @@ def test_trials_without_a_value_are_in_the_report_and_do_not_win(tmp_path, capsy
         pruned = study.ask()[1]
         pruned.report(-0.9, 1)
         study.tell(pruned)
-        report = Report(tmp_path, study, 6)
+        report = Report(tmp_path, study)
         report.ended(4)
         report.summary(["threads=1"])
         best = study.trials()[2].params
@@ -188,6 +182,6 @@ def test_a_search_whose_trials_all_fail_ends_in_one_line_and_exit_code_1(tmp_pat
     with opened(tmp_path) as study:
         study.tell(study.ask()[1], error="the loss is not finite")
         with pytest.raises(SystemExit) as stop:
-            Report(tmp_path, study, 1).summary([])
+            Report(tmp_path, study).summary([])
     assert stop.value.code == 1
     assert capsys.readouterr().err == "error: none of 1 trials came to an end; the output.txt of each says why\n"

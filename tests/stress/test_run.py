@@ -36,12 +36,12 @@ def test_a_cliff_that_is_planted_in_a_parameter_is_found_within_a_cell_and_by_bi
     mass, tolerance = axes(policy, "link_mass", "tolerance")
     with StressTest(policy, 30, seed=0) as test:
         found = test.map(mass, tolerance, 5)
-        breaks = {end: values for _, end, values in test.breaks([mass])}
+        breaks = test.breaks([mass])["link_mass"]
     stands = found.success[-1] < 15  # at the widest tolerance
     assert stands.tolist() == (found.x_values > 2.0).tolist()
     assert 0 < stands.sum() < 5
-    assert breaks[0]["success"] is None
-    assert 1.7 < breaks[1]["success"] <= 2.0
+    assert breaks["success"][0] is None
+    assert 1.7 < breaks["success"][1] <= 2.0
 
 
 def test_every_cell_has_the_same_robots_goals_and_starts_whatever_came_before_it(exported_run):
@@ -80,7 +80,7 @@ def test_the_command_draws_a_map_of_several_runs_and_writes_counts_and_intervals
     )
     output = process.communicate()[0]
     assert process.returncode == 0, output
-    assert "where less than 95 % work" in output
+    assert "where less than 95 % work" in " ".join(output.split())  # a long title is wrapped
     assert (tmp_path / "map.png").read_bytes().startswith(b"\x89PNG")
     first, second = (json.loads((run / "stress_velocity_gain_actuator_delay.json").read_text()) for run in runs)
     assert first["success"] == second["success"]  # they are one policy
