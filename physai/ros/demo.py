@@ -5,7 +5,7 @@ import os
 import signal
 import sys
 import tempfile
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Any
 
@@ -101,7 +101,7 @@ def _demo(node: DictConfig, _: Path) -> None:
     console.print(f"{path} drives a virtual {policy.metadata.robot} (randomization={config.robot})")
     with ExitStack() as stack:
         logs = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="physai-demo-")))
-        client = stack.enter_context(GoalClient(policy))
+        client = stack.enter_context(closing(GoalClient(policy)))
         client.check_alone()
         env = policy.metadata.raw["config"]["env"]["name"]
         robot = NodeProcess(
