@@ -1,5 +1,7 @@
 """What the inference node tells about itself on /diagnostics (diagnostic_msgs, REP-107)."""
 
+import math
+from collections import deque
 from typing import Any
 
 import numpy as np
@@ -29,20 +31,17 @@ class Timing:
     """
 
     def __init__(self, length: int = 100) -> None:
-        self.last = -np.inf
-        self._periods = np.full(length, np.nan)
-        self._next = 0
+        self.last = -math.inf
+        self._times: deque[float] = deque(maxlen=length + 1)
 
     def tick(self, now: float) -> None:
         """Count an update at a time, s."""
-        if np.isfinite(self.last):
-            self._periods[self._next] = now - self.last
-            self._next = (self._next + 1) % len(self._periods)
         self.last = now
+        self._times.append(now)
 
     def summary(self) -> dict[str, float | None]:
         """Mean rate, Hz, and the longest distance of a period from the mean, ms; None before the second update."""
-        periods = self._periods[np.isfinite(self._periods)]
+        periods = np.diff(self._times)
         if not len(periods):
             return {"rate_hz": None, "jitter_ms": None}
         mean = periods.mean()
