@@ -7,10 +7,9 @@ from typing import Any
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
-from rclpy.clock import Clock, ClockType
 from rclpy.exceptions import NameValidationException
 from std_msgs.msg import Bool, String
-from std_srvs.srv import SetBool, Trigger
+from std_srvs.srv import SetBool
 
 from physai.deploy import Command, Controller, ControllerConfig, Goal, Policy, State, load_policy
 from physai.deploy.goals import GoalError, accept
@@ -18,7 +17,6 @@ from physai.deploy.parameters import parameter
 from physai.errors import UserError
 from physai.ros.node import outlet
 from physai.ros.node.estop_file import EmergencyStopFile
-from physai.ros.node.parameters import declare
 from physai.ros.node.run import StoppableNode, brief, run
 from physai.ros.topics import goals, qos
 from physai.ros.topics.commands import JointCommands
@@ -57,7 +55,7 @@ class InferenceConfig(ControllerConfig):
     watchdog_timeout: float = parameter(0.1, "a watchdog silent for this long does not answer", "s", 0.01, 10.0)
 
 
-class InferenceNode(StoppableNode):
+class InferenceNode(StoppableNode[InferenceConfig]):
     """A thin shell of ROS around :class:`physai.deploy.Controller`; docs/ros2.md lists its topics and services.
 
     Raises:
@@ -65,11 +63,11 @@ class InferenceNode(StoppableNode):
     """
 
     def __init__(self) -> None:
-        super().__init__("inference_node")
+        super().__init__("inference_node", InferenceConfig)
+        config = self.config
         self._started = time.monotonic()
         self._unheard = self._started  # when no controller listened, for the last time
         self._arrived = self._started  # when commands reached the robot, for the last time
-        self.config = config = declare(self, InferenceConfig, self._configure)
         policy = _load(config)
         self._controller = Controller(policy, config)
         self._goal = _first_goal(config, policy)
@@ -96,13 +94,11 @@ class InferenceNode(StoppableNode):
         self.create_subscription(goals.goal_type(policy.metadata.goal), "~/goal", self._take_goal, 1)
         self._stop_topic = EmergencyStopTopic(self, lambda: self._emergency_stop(f"by {EMERGENCY_STOP}"))
         self.create_service(SetBool, "~/enable", self._enable)
-        self.create_service(Trigger, "~/estop", self._estop)
-        self.create_service(Trigger, "~/reset", self._reset)
-        self.create_service(Trigger, "~/shutdown", self._shutdown)
-        # Neither a paused simulation nor a change of the time of day stops these.
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self.create_timer(1.0 / config.rate_hz, self._on_timer, clock=steady)
-        self.create_timer(1.0, self._diagnose, clock=steady)
+        self.offer("~/estop", self._estop)
+        self.offer("~/reset", self._reset)
+        self.offer("~/shutdown", self._shutdown)
+        self.every(1.0 / config.rate_hz, self._on_timer)
+        self.every(1.0, self._diagnose)
         if self._stop_file.unusable and config.autostart:
             self._disabled += f": no autostart, as an emergency stop would not outlive it: {self._stop_file.unusable}"
             self.get_logger().error(self._disabled)
@@ -120,9 +116,10 @@ class InferenceNode(StoppableNode):
             return f"stopped until ~/reset ({self._stop_file.path})"
         return "starting by itself" if self._enabled else "waiting for ~/enable"
 
-    def _configure(self, changed: InferenceConfig) -> None:
-        self._controller.configure(changed)
-        self._commands.timeout = changed.watchdog_timeout
+    def configure(self, config: InferenceConfig) -> None:
+        """Have the controller and the way to the robot take other values."""
+        self._controller.configure(config)
+        self._commands.timeout = config.watchdog_timeout
 
     # What comes in
 
@@ -150,28 +147,24 @@ class InferenceNode(StoppableNode):
         response.message = "; ".join(obstacles) or "enabled"
         return response
 
-    def _estop(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+    def _estop(self) -> tuple[bool, str]:
         self._emergency_stop("by ~/estop")
-        response.success, response.message = True, "stopped until ~/reset"
-        return response
+        return True, "stopped until ~/reset"
 
-    def _reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+    def _reset(self) -> tuple[bool, str]:
         if (held := self._stop_topic.held()) is not None:
-            response.success, response.message = False, held
-            return response
+            return False, held
         latched = self._controller.reset()
         if latched:
             self._goal = None
         self._tick()
         self._stop_file.forget()
-        response.success = True
         said = "waiting for a new goal" if latched else "nothing to reset"
-        response.message = "; ".join([said, *self._blocked])
-        return response
+        return True, "; ".join([said, *self._blocked])
 
-    def _shutdown(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        self.stopped = response.success = True
-        return response
+    def _shutdown(self) -> tuple[bool, str]:
+        self.stopped = True
+        return True, ""
 
     def _emergency_stop(self, source: str) -> None:
         if self._command.state is State.ESTOP:  # several subscriptions hear the same message
