@@ -130,9 +130,7 @@ class Outlet:
             try:
                 data = data[os.write(self._real, data) :]
             except BlockingIOError:  # another program has made it so
-                waiting = select.poll()
-                waiting.register(self._real, select.POLLOUT)
-                waiting.poll()
+                select.select([], [self._real], [])
             except OSError:
                 return False
         return True
@@ -142,26 +140,7 @@ def _gap(lines: int) -> bytes:
     return f"[WARN] {lines} lines of this output are missing here: they were not taken in time\n".encode() * (lines > 0)
 
 
-class _Descriptor(io.RawIOBase):
-    """Writes what there is room for, and never fails."""
-
-    def __init__(self, number: int) -> None:
-        self._number = number
-
-    def writable(self) -> bool:
-        return True
-
-    def fileno(self) -> int:
-        return self._number
-
-    def write(self, data: Any) -> int:
-        with contextlib.suppress(OSError):
-            rest = memoryview(data)
-            while rest:
-                rest = rest[os.write(self._number, rest) :]
-        return len(data)
-
-
 def _text(number: int) -> io.TextIOWrapper:
-    descriptor: Any = _Descriptor(number)  # which is as good as a buffered writer here: there is nothing to wait for
+    # Nothing between: a write that finds no room returns at once, and there is nothing to wait for at the end.
+    descriptor: Any = io.FileIO(number, "w", closefd=False)
     return io.TextIOWrapper(descriptor, "utf-8", "backslashreplace", line_buffering=True)
