@@ -112,18 +112,15 @@ def _demo(node: DictConfig, _: Path) -> None:
             randomization=config.robot,
             seed=config.seed,
         )
+        period = 1.0 / policy.metadata.control_rate
+        margin = smallest_margin(config.max_velocity, ControllerConfig.state_timeout, period)
         inference = NodeProcess(
             "physai.ros.inference_node",
             logs / "inference",
             policy_path=path,
             autostart=True,
             max_velocity=config.max_velocity,
-            limit_margin=max(
-                ControllerConfig.limit_margin,
-                smallest_margin(
-                    config.max_velocity, ControllerConfig.state_timeout, 1.0 / policy.metadata.control_rate
-                ),
-            ),
+            limit_margin=max(ControllerConfig.limit_margin, margin),
         )
         for process in (robot, inference):
             stack.enter_context(process)

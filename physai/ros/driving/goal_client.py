@@ -129,10 +129,9 @@ class GoalClient:
             UserError: If they do not come.
         """
         ready = (State.WAITING.value, State.REACHED.value)
-        self._spin(
-            lambda: bool(self.record.times) and self._state in ready and self._goals.get_subscription_count(), _START
-        )
-        if not self.record.times or self._state not in ready:
+        if not self._spin(
+            lambda: self.record.times and self._state in ready and self._goals.get_subscription_count(), _START
+        ):
             raise UserError(f"the nodes do not work: joint states: {bool(self.record.times)}, state: '{self._state}'")
 
     def send(self, goal: np.ndarray, hold: float) -> GoalResult:
