@@ -43,7 +43,7 @@ class StoppableNode(Node, Generic[P]):
     Attributes:
         config: The values of the parameters, as they are now.
         stopped: Set it to end the program.
-        code: The exit code of a program that has ended by its own wish.
+        code: The exit code.
 
     Raises:
         UserError: If a parameter is wrong.
@@ -93,7 +93,8 @@ def run(make_node: Callable[[], StoppableNode[P]], module: str, about: str, kind
         kind: Its parameters, for the help text.
 
     Returns:
-        The exit code: the node's own (0) after a signal or by its own wish, 1 after an exception, 2 if the user's input was wrong.
+        The exit code: 0 after a signal or by its own wish (or what the node says), 1 after an exception, 2 if the
+        user's input was wrong.
     """
     caught = signals.catch()
     parser = argparse.ArgumentParser(
@@ -108,12 +109,6 @@ def run(make_node: Callable[[], StoppableNode[P]], module: str, about: str, kind
     except (RuntimeError, UserError) as error:  # RCLError: such as a file of parameters that does not exist
         return _refuse(brief(error))
     with outlets():
-        try:
-            rclpy.init(
-                args=[*sys.argv[:1], *_NO_LOG_FILES, *sys.argv[1:]], signal_handler_options=SignalHandlerOptions.NO
-            )
-        except RuntimeError as error:  # RCLError
-            return _refuse(_of_ros(error))
         try:
             return _run(make_node, caught)
         finally:
@@ -138,6 +133,7 @@ def prepare_middleware() -> None:
 
 def _run(make_node: Callable[[], StoppableNode[P]], caught: Mapping[int, object]) -> int:
     try:
+        rclpy.init(args=[*sys.argv[:1], *_NO_LOG_FILES, *sys.argv[1:]], signal_handler_options=SignalHandlerOptions.NO)
         node = make_node()
     except (UserError, ParameterException) as error:  # such as a use_sim_time that is no bool
         return _refuse(str(error))
@@ -150,14 +146,14 @@ def _run(make_node: Callable[[], StoppableNode[P]], caught: Mapping[int, object]
     gc.freeze()  # to look for garbage in all that is imported would hold up every command for a tenth of a second
     executor = SingleThreadedExecutor()
     executor.add_node(node)
-    code, last_words = None, ""
+    last_words = ""
     try:
         while not node.stopped and not caught:
             executor.spin_once(timeout_sec=0.1)
     except UserError as error:
-        code, last_words = 2, str(error)
+        node.code, last_words = 2, str(error)
     except Exception as error:
-        code, last_words = 1, f"{type(error).__name__} ends this node: {error}\n{traceback.format_exc()}"
+        node.code, last_words = 1, f"{type(error).__name__} ends this node: {error}\n{traceback.format_exc()}"
     finally:
         node.finish()  # before anything else
     log = node.get_logger()
@@ -167,7 +163,7 @@ def _run(make_node: Callable[[], StoppableNode[P]], caught: Mapping[int, object]
         log.info(f"{signal.Signals(next(iter(caught))).name} ends this node" if caught else "this node ends")
     executor.shutdown(timeout_sec=1.0)
     node.destroy_node()
-    return node.code if code is None else code
+    return node.code
 
 
 def _of_ros(error: Exception) -> str:
