@@ -70,7 +70,6 @@ class Recorder(StoppableNode[RecordConfig]):
         self._topics = _resolve(self, config.topics)
         self._bag = Bag(Path(config.output or time.strftime("outputs/recording_%Y-%m-%d_%H-%M-%S")))
         self._heard: dict[tuple[Any, ...], Subscription | None] = {}
-        self._begun: set[tuple[str, str]] = set()
         self._recent: defaultdict[str, OrderedDict[tuple[int, int], None]] = defaultdict(OrderedDict)
         self.every(_LOOK, self._look)
         self.every(_FLUSH, self._flush)
@@ -124,8 +123,7 @@ class Recorder(StoppableNode[RecordConfig]):
     def _take(self, topic: str, kind: str, data: bytes, info: dict[str, int]) -> None:
         if self.code or self._seen(topic, info):
             return
-        if (topic, kind) not in self._begun:
-            self._begun.add((topic, kind))
+        if (topic, kind) not in self._bag:
             publishers = self.get_publishers_info_by_topic(topic)
             self._bag.add(topic, kind, [_to_bag(found.qos_profile) for found in publishers if found.topic_type == kind])
             self.get_logger().info(f"{topic}: the first message ({kind})")
@@ -149,7 +147,7 @@ class Recorder(StoppableNode[RecordConfig]):
                 self._bag.flush()
 
     def _tell(self) -> None:
-        self.get_logger().info(f"{sum(self._bag.counts.values()):,} messages, {self._bag.size / 1e6:.1f} MB")
+        self.get_logger().info(f"{self._bag.counts.total():,} messages, {self._bag.size / 1e6:.1f} MB")
 
     # The end
 
@@ -177,7 +175,7 @@ class Recorder(StoppableNode[RecordConfig]):
         if self.code:
             return
         for topic in self._topics:
-            self.get_logger().info(f"{topic}: {self._bag.counts.get(topic, 0):,} messages")
+            self.get_logger().info(f"{topic}: {self._bag.counts[topic]:,} messages")
         self._tell()
         self.get_logger().info(f"recorded to {self._bag.folder}")
 
