@@ -119,13 +119,8 @@ class CommandWatchdog(StoppableNode[WatchdogConfig]):
         self._look()
         return not self._conflict, self._conflict
 
-    @property
-    def _can_stop(self) -> bool:
-        """Whether it is known what stands still: positions only once some have been passed on."""
-        return bool(self._commands.still)
-
     def _stop(self, reason: str) -> None:
-        if not self._can_stop:
+        if self._commands.still is None:  # positions are known only once some have been passed on
             return
         self._commands.stop()
         if reason != self._reason:
@@ -134,8 +129,7 @@ class CommandWatchdog(StoppableNode[WatchdogConfig]):
 
     def finish(self) -> None:
         """See that the last command that the robot got stands still."""
-        if self._can_stop:
-            self._commands.finish()
+        self._commands.finish()
 
 
 def main() -> int:

@@ -27,7 +27,7 @@ class JointCommands:
 
     Args:
         node: Whose remaps hold.
-        joints: How many numbers a command has.
+        joints: How many numbers a command has; 0 where that is not known yet.
         quantity: What they are, joint velocities or joint positions.
         topic: Where to; None for the controller itself.
         partners: Who publishes this other topic may publish here, too; empty if nobody may.
@@ -46,7 +46,7 @@ class JointCommands:
     def __init__(
         self, node: Node, joints: int, quantity: Quantity, topic: str | None = None, partners: str = ""
     ) -> None:
-        self.still = [0.0] * joints if quantity is Quantity.JOINT_VELOCITY else None
+        self.still = [0.0] * joints if joints and quantity is Quantity.JOINT_VELOCITY else None
         self._publisher = node.create_publisher(
             Float64MultiArray, topic or controller_topic(quantity), qos.COMMAND, event_callbacks=qos.SILENT_PUBLISHER
         )
