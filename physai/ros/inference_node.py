@@ -1,5 +1,6 @@
 """The node that drives a robot: joint states and goals in, joint commands out, 50 times a second."""
 
+import math
 import sys
 import time
 from dataclasses import dataclass
@@ -20,7 +21,7 @@ from physai.ros.node.estop_file import EmergencyStopFile
 from physai.ros.node.run import StoppableNode, brief, run
 from physai.ros.topics import goals, qos
 from physai.ros.topics.commands import JointCommands
-from physai.ros.topics.diagnostics import Timing, diagnose
+from physai.ros.topics.diagnostics import Timing, diagnose, summary
 from physai.ros.topics.emergency_stop import TOPIC as EMERGENCY_STOP
 from physai.ros.topics.emergency_stop import EmergencyStopTopic
 from physai.ros.topics.joint_states import JointStates
@@ -65,9 +66,8 @@ class InferenceNode(StoppableNode[InferenceConfig]):
     def __init__(self) -> None:
         super().__init__("inference_node", InferenceConfig)
         config = self.config
-        self._started = time.monotonic()
-        self._unheard = self._started  # when no controller listened, for the last time
-        self._arrived = self._started  # when commands reached the robot, for the last time
+        self._known = time.monotonic() + _DISCOVERY  # when who else commands the robot will surely have been found
+        self._arrived = time.monotonic()  # when commands reached the robot, for the last time
         policy = _load(config)
         self._controller = Controller(policy, config)
         self._goal = _first_goal(config, policy)
@@ -79,12 +79,11 @@ class InferenceNode(StoppableNode[InferenceConfig]):
         self._publishing = False  # whether this node has a say in what the arm does
         self._contested = False
         self._blocked: list[str] = []  # by interlocks
-        self._late = 1.5 / config.rate_hz
+        self._answered = -math.inf  # when a joint state was answered, for the last time
         self._timing = Timing()
         joints = config.joints or policy.metadata.joints
         self._index = [joints.index(joint) for joint in policy.metadata.joints]
-        self._sent = [0.0] * len(joints)
-        self._moving = False
+        self._joints = len(joints)
         self._takes_positions = policy.metadata.command.quantity is Quantity.JOINT_POSITION
 
         self._commands = _commands(self, len(joints), policy.metadata.command.quantity, config)
@@ -125,8 +124,8 @@ class InferenceNode(StoppableNode[InferenceConfig]):
 
     def _on_joint_states(self) -> None:
         if self.config.trigger == "joint_state":
-            self._late = 1.5 / self.config.rate_hz
-            self._timing.tick(time.monotonic())
+            self._answered = time.monotonic()
+            self._timing.tick(self._answered)
             self._tick()
 
     def _take_goal(self, message: Any) -> None:
@@ -177,11 +176,10 @@ class InferenceNode(StoppableNode[InferenceConfig]):
     # What goes out
 
     def _on_timer(self) -> None:
-        if self.config.trigger == "joint_state" and time.monotonic() - self._timing.last <= self._late:
-            return
-        self._late = 0.0  # until a joint state comes, every period
-        self._timing.tick(time.monotonic())
-        self._tick()
+        now = time.monotonic()
+        if now - self._answered > 1.5 / self.config.rate_hz:
+            self._timing.tick(now)
+            self._tick()
 
     def _tick(self) -> None:
         now = time.monotonic()
@@ -218,8 +216,8 @@ class InferenceNode(StoppableNode[InferenceConfig]):
             found.append(silence)
         if (unheard := self._commands.unheard) is not None:
             found.append(unheard)
-            self._unheard = now
-        elif now - self._started < _DISCOVERY or now - self._unheard < _REDISCOVERY:
+            self._known = max(self._known, now + _REDISCOVERY)
+        elif now < self._known:
             found.append("looking for other nodes")
         elif self._enabled and not self._contested:
             self._publishing = True
@@ -239,7 +237,7 @@ class InferenceNode(StoppableNode[InferenceConfig]):
 
     def _publish(self, command: Command) -> None:
         # A disabled node does not disturb another one, once it stands still, and unless there is an emergency.
-        stands = self._contested and not self._enabled and not self._moving
+        stands = self._contested and not self._enabled and self._command.state is not State.ACTIVE
         silent = stands and command.state is not State.ESTOP
         if command.value is None or silent or not self._publishing:
             return
@@ -247,13 +245,12 @@ class InferenceNode(StoppableNode[InferenceConfig]):
             moves = command.state is State.ACTIVE
             self._commands.still = self._in_order(self._controller.standstill if moves else command.value)
         self._commands.send(self._in_order(command.value))
-        self._moving = command.state is State.ACTIVE
 
     def _in_order(self, values: np.ndarray) -> list[float]:
         """Values of the policy's joints, in the controller's order; other joints stand still."""
-        for index, value in zip(self._index, values.tolist(), strict=True):
-            self._sent[index] = value
-        return self._sent.copy()
+        ordered = np.zeros(self._joints)
+        ordered[self._index] = values
+        return ordered.tolist()
 
     def _announce(self) -> None:
         command = self._command
@@ -262,7 +259,7 @@ class InferenceNode(StoppableNode[InferenceConfig]):
         self._states.publish(String(data=command.state.value))
         self._estopped.publish(Bool(data=command.state is State.ESTOP))
         self._diagnose()
-        text = ": ".join([command.state.value, "; ".join(command.reasons)][: 2 if command.reasons else 1])
+        text = summary(command.state.value, command.reasons)
         if command.state in (State.FAULT, State.ESTOP):
             self.get_logger().error(text)
         elif command.state is State.HOLD:
