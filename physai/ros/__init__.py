@@ -15,18 +15,16 @@ _WITHOUT_ROS = "rclpy is not installed: pip install 'physai[ros]', or source ROS
 outlet.open_closed()
 if sys.argv[:1] == ["-m"]:  # python -m physai.ros.<node>
     signals.end_quietly()
-if sys.argv[:1] == ["-m"] and importlib.util.find_spec("rclpy") is None:
-    print(f"error: {_WITHOUT_ROS}", file=sys.stderr)
-    sys.exit(2)
+    if importlib.util.find_spec("rclpy") is None:
+        print(f"error: {_WITHOUT_ROS}", file=sys.stderr)
+        sys.exit(2)
 
 
 def __getattr__(name: str) -> Any:
     if name != "RosPhysics":  # imported when it is asked for: this package needs no ROS
         raise AttributeError(f"module '{__name__}' has no attribute '{name}'")
-    try:
-        import rclpy  # noqa: F401
-    except ModuleNotFoundError as error:
-        raise UserError(_WITHOUT_ROS) from error
+    if importlib.util.find_spec("rclpy") is None:
+        raise UserError(_WITHOUT_ROS)
     from physai.ros.bridge.physics import RosPhysics
 
     return RosPhysics

@@ -123,7 +123,7 @@ class Recorder(StoppableNode[RecordConfig]):
     def _take(self, topic: str, kind: str, data: bytes, info: dict[str, int]) -> None:
         if self.code or self._seen(topic, info):
             return
-        if (topic, kind) not in self._bag:
+        if (topic, kind) not in self._bag.connections:
             publishers = self.get_publishers_info_by_topic(topic)
             self._bag.add(topic, kind, [_to_bag(found.qos_profile) for found in publishers if found.topic_type == kind])
             self.get_logger().info(f"{topic}: the first message ({kind})")

@@ -34,6 +34,7 @@ class Bag:
         folder: Is made, with its parents.
 
     Attributes:
+        connections: Topics, with the types of their messages, that there is place for.
         counts: Messages written, by topic.
         size: Bytes of messages written.
 
@@ -45,7 +46,7 @@ class Bag:
         self.folder = folder
         self.counts: Counter[str] = Counter()
         self.size = 0
-        self._connections: dict[tuple[str, str], Connection] = {}
+        self.connections: dict[tuple[str, str], Connection] = {}
         if folder.exists():
             raise UserError(f"{folder} exists already")
         with _clearly(folder):
@@ -58,20 +59,16 @@ class Bag:
     def _storage(self) -> McapWriter:
         return cast(McapWriter, self._writer.storage)
 
-    def __contains__(self, topic_and_kind: tuple[str, str]) -> bool:
-        """Whether there is place for messages of a type on a topic."""
-        return topic_and_kind in self._connections
-
     def add(self, topic: str, kind: str, offered: Sequence[Qos] = ()) -> None:
         """Make place for messages of a type in :data:`TYPES`."""
-        self._connections[topic, kind] = self._writer.add_connection(
+        self.connections[topic, kind] = self._writer.add_connection(
             topic, kind, typestore=TYPES, offered_qos_profiles=offered
         )
 
     def write(self, topic: str, kind: str, stamp: int, data: bytes) -> None:
         """Write a message: the time at which it came, ns, and its CDR, as the wire has it."""
         with _clearly(self.folder):
-            self._writer.write(self._connections[topic, kind], stamp, data)
+            self._writer.write(self.connections[topic, kind], stamp, data)
         self.counts[topic] += 1
         self.size += len(data)
 
