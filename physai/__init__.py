@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 __all__ = ["UserError", "make_env"]
 
-_GYMNASIUM_IDS = {"physai/Reacher-v0": "reacher", "physai/KukaReacher-v0": "kuka_reacher"}
+_GYMNASIUM_IDS = {"Reacher": "reacher", "KukaReacher": "kuka_reacher", "RosReacher": "ros_reacher"}
 
 
 def make_env(*args: Any, **kwargs: Any) -> "TransformedRobotEnv":
@@ -30,13 +30,12 @@ def _register() -> None:
 
     for name, env in _GYMNASIUM_IDS.items():
         register(
-            name,
+            f"physai/{name}-v0",
             entry_point="physai.envs.gym_env:RobotGymEnv",
             vector_entry_point="physai.envs.gym_env:RobotVectorEnv",
             kwargs={"env": env},
+            nondeterministic=env == "ros_reacher",  # in real time nothing moves twice in exactly the same way
         )
-    # What moves in real time never moves twice in exactly the same way.
-    register("physai/RosReacher-v0", entry_point="physai.ros:RosReacherEnv", nondeterministic=True)
 
 
 if importlib.util.find_spec("gymnasium") is not None:  # a robot that only runs policies may not have it

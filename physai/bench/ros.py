@@ -11,10 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import rclpy
-from rclpy.context import Context
-from rclpy.executors import SingleThreadedExecutor
-from rclpy.signals import SignalHandlerOptions
 from rich.table import Table
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray, String
@@ -25,7 +21,7 @@ from physai.bench.timing import table
 from physai.deploy import read_metadata
 from physai.errors import UserError
 from physai.ros.driving.processes import NodeProcess
-from physai.ros.node.run import prepare_middleware
+from physai.ros.node.guest import Guest
 from physai.ros.topics import qos
 from physai.ros.topics.commands import controller_topic
 from physai.signals import Quantity
@@ -61,12 +57,8 @@ class _Listener:
     """A node in this process, spun in the foreground."""
 
     def __init__(self) -> None:
-        prepare_middleware()
-        self._context = Context()
-        rclpy.init(context=self._context, signal_handler_options=SignalHandlerOptions.NO)
-        self.node = rclpy.create_node("bench", context=self._context)
-        self._executor = SingleThreadedExecutor(context=self._context)
-        self._executor.add_node(self.node)
+        self._guest = Guest("bench")
+        self.node = self._guest.node
 
     def listen(self, topic: str, kind: Any = Float64MultiArray, profile: Any = 100) -> list[tuple[float, int]]:
         """Collect (time of arrival, s, and the sender's time of sending, ns) of all messages to come."""
@@ -81,15 +73,13 @@ class _Listener:
     def spin(self, done: Callable[[], object], seconds: float) -> bool:
         end = time.monotonic() + seconds
         while time.monotonic() < end:
-            self._executor.spin_once(max(0.0, min(0.05, end - time.monotonic())))
+            self._guest.executor.spin_once(max(0.0, min(0.05, end - time.monotonic())))
             if done():
                 return True
         return False
 
     def close(self) -> None:
-        self._executor.shutdown()
-        self.node.destroy_node()
-        self._context.try_shutdown()
+        self._guest.close()
 
 
 def run(options: Namespace) -> Table:

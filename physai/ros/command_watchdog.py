@@ -12,13 +12,10 @@ import sys
 import time
 from dataclasses import dataclass
 
-from rclpy.clock import Clock, ClockType
 from rclpy.subscription import Subscription
 from std_msgs.msg import Empty, Float64MultiArray
-from std_srvs.srv import Trigger
 
 from physai.deploy.parameters import Parameters, parameter
-from physai.ros.node.parameters import declare
 from physai.ros.node.run import StoppableNode, run
 from physai.ros.topics import qos
 from physai.ros.topics.commands import JointCommands
@@ -42,12 +39,12 @@ class WatchdogConfig(Parameters):
     )
 
 
-class CommandWatchdog(StoppableNode):
+class CommandWatchdog(StoppableNode[WatchdogConfig]):
     """Passes commands on while they come."""
 
     def __init__(self) -> None:
-        super().__init__("command_watchdog")
-        self._config = config = declare(self, WatchdogConfig, self._configure)
+        super().__init__("command_watchdog", WatchdogConfig)
+        config = self.config
         # Before the commands: who hears of these knows then that they are ours.
         self._heartbeat = self.create_publisher(Empty, "~/heartbeat", qos.COMMAND, event_callbacks=qos.SILENT_PUBLISHER)
         self._commands = JointCommands(self, config.joints, Quantity(config.command), partners="~/commands")
@@ -59,13 +56,10 @@ class CommandWatchdog(StoppableNode):
         self._deaf_until = -math.inf
         self._conflict = ""
         self._reason = ""
-        self.create_service(Trigger, "~/reset", self._reset)
+        self.offer("~/reset", self._reset)
         source = self.resolve_topic_name("~/commands")
         self.get_logger().info(f"passing commands from {source} to {self._commands.topic}")
-        self.create_timer(1.0 / config.rate_hz, self._check, clock=Clock(clock_type=ClockType.STEADY_TIME))
-
-    def _configure(self, config: WatchdogConfig) -> None:
-        self._config = config
+        self.every(1.0 / config.rate_hz, self._check)
 
     def _relay(self, message: Float64MultiArray, info: dict[str, int]) -> None:
         self._look()
@@ -73,7 +67,7 @@ class CommandWatchdog(StoppableNode):
         sound = len(command) > 0 and all(map(math.isfinite, command))
         if not self._joints and sound:
             self._joints = len(command)
-            self._commands.resize(self._joints)
+            self._commands.still = None if self._positions else [0.0] * self._joints
         if time.monotonic() < self._deaf_until:
             return
         self._last = qos.received_at(info)
@@ -93,8 +87,8 @@ class CommandWatchdog(StoppableNode):
         self._look()
         if self._conflict:
             self._stop(self._conflict)
-        elif time.monotonic() - self._last > self._config.timeout:
-            self._stop(f"no command for {self._config.timeout:g} s")
+        elif time.monotonic() - self._last > self.config.timeout:
+            self._stop(f"no command for {self.config.timeout:g} s")
         # Not while commands would be lost: the arm would miss the beginning of a motion, or seem not to follow.
         passing = time.monotonic() >= self._deaf_until and not self._conflict
         if passing and self._source is not None and self._source.get_publisher_count():
@@ -113,26 +107,20 @@ class CommandWatchdog(StoppableNode):
 
     def _look(self) -> None:
         now = time.monotonic()
-        if now - self._looked > self._config.timeout:
+        if now - self._looked > self.config.timeout:
             # This process stood still: what has waited for it is old, and its sender may be gone.
-            self._deaf_until = now + self._config.timeout
+            self._deaf_until = now + self.config.timeout
         self._looked = now
         if rival := self._commands.rival:
             self._conflict = f"{rival}; until ~/reset"
 
-    def _reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+    def _reset(self) -> tuple[bool, str]:
         self._conflict = ""
         self._look()
-        response.success, response.message = not self._conflict, self._conflict
-        return response
-
-    @property
-    def _can_stop(self) -> bool:
-        """Whether it is known what stands still: positions only once some have been passed on."""
-        return bool(self._commands.still)
+        return not self._conflict, self._conflict
 
     def _stop(self, reason: str) -> None:
-        if not self._can_stop:
+        if self._commands.still is None:  # positions are known only once some have been passed on
             return
         self._commands.stop()
         if reason != self._reason:
@@ -141,8 +129,7 @@ class CommandWatchdog(StoppableNode):
 
     def finish(self) -> None:
         """See that the last command that the robot got stands still."""
-        if self._can_stop:
-            self._commands.finish()
+        self._commands.finish()
 
 
 def main() -> int:

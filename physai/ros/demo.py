@@ -5,7 +5,7 @@ import os
 import signal
 import sys
 import tempfile
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Any
 
@@ -101,7 +101,7 @@ def _demo(node: DictConfig, _: Path) -> None:
     console.print(f"{path} drives a virtual {policy.metadata.robot} (randomization={config.robot})")
     with ExitStack() as stack:
         logs = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="physai-demo-")))
-        client = stack.enter_context(GoalClient(policy))
+        client = stack.enter_context(closing(GoalClient(policy)))
         client.check_alone()
         env = policy.metadata.raw["config"]["env"]["name"]
         robot = NodeProcess(
@@ -112,18 +112,15 @@ def _demo(node: DictConfig, _: Path) -> None:
             randomization=config.robot,
             seed=config.seed,
         )
+        period = 1.0 / policy.metadata.control_rate
+        margin = smallest_margin(config.max_velocity, ControllerConfig.state_timeout, period)
         inference = NodeProcess(
             "physai.ros.inference_node",
             logs / "inference",
             policy_path=path,
             autostart=True,
             max_velocity=config.max_velocity,
-            limit_margin=max(
-                ControllerConfig.limit_margin,
-                smallest_margin(
-                    config.max_velocity, ControllerConfig.state_timeout, 1.0 / policy.metadata.control_rate
-                ),
-            ),
+            limit_margin=max(ControllerConfig.limit_margin, margin),
         )
         for process in (robot, inference):
             stack.enter_context(process)

@@ -1,5 +1,6 @@
 """The node that drives a robot: joint states and goals in, joint commands out, 50 times a second."""
 
+import math
 import sys
 import time
 from dataclasses import dataclass
@@ -7,10 +8,9 @@ from typing import Any
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
-from rclpy.clock import Clock, ClockType
 from rclpy.exceptions import NameValidationException
 from std_msgs.msg import Bool, String
-from std_srvs.srv import SetBool, Trigger
+from std_srvs.srv import SetBool
 
 from physai.deploy import Command, Controller, ControllerConfig, Goal, Policy, State, load_policy
 from physai.deploy.goals import GoalError, accept
@@ -18,11 +18,10 @@ from physai.deploy.parameters import parameter
 from physai.errors import UserError
 from physai.ros.node import outlet
 from physai.ros.node.estop_file import EmergencyStopFile
-from physai.ros.node.parameters import declare
 from physai.ros.node.run import StoppableNode, brief, run
 from physai.ros.topics import goals, qos
 from physai.ros.topics.commands import JointCommands
-from physai.ros.topics.diagnostics import Timing, diagnose
+from physai.ros.topics.diagnostics import Timing, diagnose, summary
 from physai.ros.topics.emergency_stop import TOPIC as EMERGENCY_STOP
 from physai.ros.topics.emergency_stop import EmergencyStopTopic
 from physai.ros.topics.joint_states import JointStates
@@ -57,7 +56,7 @@ class InferenceConfig(ControllerConfig):
     watchdog_timeout: float = parameter(0.1, "a watchdog silent for this long does not answer", "s", 0.01, 10.0)
 
 
-class InferenceNode(StoppableNode):
+class InferenceNode(StoppableNode[InferenceConfig]):
     """A thin shell of ROS around :class:`physai.deploy.Controller`; docs/ros2.md lists its topics and services.
 
     Raises:
@@ -65,11 +64,10 @@ class InferenceNode(StoppableNode):
     """
 
     def __init__(self) -> None:
-        super().__init__("inference_node")
-        self._started = time.monotonic()
-        self._unheard = self._started  # when no controller listened, for the last time
-        self._arrived = self._started  # when commands reached the robot, for the last time
-        self.config = config = declare(self, InferenceConfig, self._configure)
+        super().__init__("inference_node", InferenceConfig)
+        config = self.config
+        self._known = time.monotonic() + _DISCOVERY  # when who else commands the robot will surely have been found
+        self._arrived = time.monotonic()  # when commands reached the robot, for the last time
         policy = _load(config)
         self._controller = Controller(policy, config)
         self._goal = _first_goal(config, policy)
@@ -81,12 +79,11 @@ class InferenceNode(StoppableNode):
         self._publishing = False  # whether this node has a say in what the arm does
         self._contested = False
         self._blocked: list[str] = []  # by interlocks
-        self._late = 1.5 / config.rate_hz
+        self._answered = -math.inf  # when a joint state was answered, for the last time
         self._timing = Timing()
         joints = config.joints or policy.metadata.joints
         self._index = [joints.index(joint) for joint in policy.metadata.joints]
-        self._sent = [0.0] * len(joints)
-        self._moving = False
+        self._joints = len(joints)
         self._takes_positions = policy.metadata.command.quantity is Quantity.JOINT_POSITION
 
         self._commands = _commands(self, len(joints), policy.metadata.command.quantity, config)
@@ -96,13 +93,11 @@ class InferenceNode(StoppableNode):
         self.create_subscription(goals.goal_type(policy.metadata.goal), "~/goal", self._take_goal, 1)
         self._stop_topic = EmergencyStopTopic(self, lambda: self._emergency_stop(f"by {EMERGENCY_STOP}"))
         self.create_service(SetBool, "~/enable", self._enable)
-        self.create_service(Trigger, "~/estop", self._estop)
-        self.create_service(Trigger, "~/reset", self._reset)
-        self.create_service(Trigger, "~/shutdown", self._shutdown)
-        # Neither a paused simulation nor a change of the time of day stops these.
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self.create_timer(1.0 / config.rate_hz, self._on_timer, clock=steady)
-        self.create_timer(1.0, self._diagnose, clock=steady)
+        self.offer("~/estop", self._estop)
+        self.offer("~/reset", self._reset)
+        self.offer("~/shutdown", self._shutdown)
+        self.every(1.0 / config.rate_hz, self._on_timer)
+        self.every(1.0, self._diagnose)
         if self._stop_file.unusable and config.autostart:
             self._disabled += f": no autostart, as an emergency stop would not outlive it: {self._stop_file.unusable}"
             self.get_logger().error(self._disabled)
@@ -120,16 +115,17 @@ class InferenceNode(StoppableNode):
             return f"stopped until ~/reset ({self._stop_file.path})"
         return "starting by itself" if self._enabled else "waiting for ~/enable"
 
-    def _configure(self, changed: InferenceConfig) -> None:
-        self._controller.configure(changed)
-        self._commands.timeout = changed.watchdog_timeout
+    def configure(self, config: InferenceConfig) -> None:
+        """Have the controller and the way to the robot take other values."""
+        self._controller.configure(config)
+        self._commands.timeout = config.watchdog_timeout
 
     # What comes in
 
     def _on_joint_states(self) -> None:
         if self.config.trigger == "joint_state":
-            self._late = 1.5 / self.config.rate_hz
-            self._timing.tick(time.monotonic())
+            self._answered = time.monotonic()
+            self._timing.tick(self._answered)
             self._tick()
 
     def _take_goal(self, message: Any) -> None:
@@ -150,28 +146,24 @@ class InferenceNode(StoppableNode):
         response.message = "; ".join(obstacles) or "enabled"
         return response
 
-    def _estop(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+    def _estop(self) -> tuple[bool, str]:
         self._emergency_stop("by ~/estop")
-        response.success, response.message = True, "stopped until ~/reset"
-        return response
+        return True, "stopped until ~/reset"
 
-    def _reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+    def _reset(self) -> tuple[bool, str]:
         if (held := self._stop_topic.held()) is not None:
-            response.success, response.message = False, held
-            return response
+            return False, held
         latched = self._controller.reset()
         if latched:
             self._goal = None
         self._tick()
         self._stop_file.forget()
-        response.success = True
         said = "waiting for a new goal" if latched else "nothing to reset"
-        response.message = "; ".join([said, *self._blocked])
-        return response
+        return True, "; ".join([said, *self._blocked])
 
-    def _shutdown(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        self.stopped = response.success = True
-        return response
+    def _shutdown(self) -> tuple[bool, str]:
+        self.stopped = True
+        return True, ""
 
     def _emergency_stop(self, source: str) -> None:
         if self._command.state is State.ESTOP:  # several subscriptions hear the same message
@@ -184,11 +176,10 @@ class InferenceNode(StoppableNode):
     # What goes out
 
     def _on_timer(self) -> None:
-        if self.config.trigger == "joint_state" and time.monotonic() - self._timing.last <= self._late:
-            return
-        self._late = 0.0  # until a joint state comes, every period
-        self._timing.tick(time.monotonic())
-        self._tick()
+        now = time.monotonic()
+        if now - self._answered > 1.5 / self.config.rate_hz:
+            self._timing.tick(now)
+            self._tick()
 
     def _tick(self) -> None:
         now = time.monotonic()
@@ -225,8 +216,8 @@ class InferenceNode(StoppableNode):
             found.append(silence)
         if (unheard := self._commands.unheard) is not None:
             found.append(unheard)
-            self._unheard = now
-        elif now - self._started < _DISCOVERY or now - self._unheard < _REDISCOVERY:
+            self._known = max(self._known, now + _REDISCOVERY)
+        elif now < self._known:
             found.append("looking for other nodes")
         elif self._enabled and not self._contested:
             self._publishing = True
@@ -246,7 +237,7 @@ class InferenceNode(StoppableNode):
 
     def _publish(self, command: Command) -> None:
         # A disabled node does not disturb another one, once it stands still, and unless there is an emergency.
-        stands = self._contested and not self._enabled and not self._moving
+        stands = self._contested and not self._enabled and self._command.state is not State.ACTIVE
         silent = stands and command.state is not State.ESTOP
         if command.value is None or silent or not self._publishing:
             return
@@ -254,13 +245,12 @@ class InferenceNode(StoppableNode):
             moves = command.state is State.ACTIVE
             self._commands.still = self._in_order(self._controller.standstill if moves else command.value)
         self._commands.send(self._in_order(command.value))
-        self._moving = command.state is State.ACTIVE
 
     def _in_order(self, values: np.ndarray) -> list[float]:
         """Values of the policy's joints, in the controller's order; other joints stand still."""
-        for index, value in zip(self._index, values.tolist(), strict=True):
-            self._sent[index] = value
-        return self._sent.copy()
+        ordered = np.zeros(self._joints)
+        ordered[self._index] = values
+        return ordered.tolist()
 
     def _announce(self) -> None:
         command = self._command
@@ -269,7 +259,7 @@ class InferenceNode(StoppableNode):
         self._states.publish(String(data=command.state.value))
         self._estopped.publish(Bool(data=command.state is State.ESTOP))
         self._diagnose()
-        text = ": ".join([command.state.value, "; ".join(command.reasons)][: 2 if command.reasons else 1])
+        text = summary(command.state.value, command.reasons)
         if command.state in (State.FAULT, State.ESTOP):
             self.get_logger().error(text)
         elif command.state is State.HOLD:

@@ -6,21 +6,21 @@ all but the last tenth of a second, and is completed by -p recover:=<folder>.
 
 import sys
 import time
-from collections import deque
+from collections import OrderedDict, defaultdict
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from rclpy.clock import Clock, ClockType
 from rclpy.qos import QoSProfile
 from rclpy.subscription import Subscription
 from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
 
 from physai.deploy.parameters import Parameters, parameter
 from physai.errors import UserError
-from physai.ros.node.parameters import declare
 from physai.ros.node.run import StoppableNode, brief, run
 from physai.ros.recording.bag import TYPES, Bag, recover
 from physai.ros.topics import commands, qos
@@ -52,7 +52,7 @@ class RecordConfig(Parameters):
     recover: str = parameter("", "recording of a killed recorder: complete it, and do nothing else", fixed=True)
 
 
-class Recorder(StoppableNode):
+class Recorder(StoppableNode[RecordConfig]):
     """Writes down every message of some topics, once.
 
     Raises:
@@ -60,10 +60,8 @@ class Recorder(StoppableNode):
     """
 
     def __init__(self) -> None:
-        super().__init__("recorder")
-        self.failed = False
-        self._bag: Bag | None = None
-        config = declare(self, RecordConfig, lambda _: None)
+        super().__init__("recorder", RecordConfig)
+        config = self.config
         if config.recover:
             count = recover(Path(config.recover))
             self.get_logger().info(f"{config.recover} is complete: {count:,} messages")
@@ -72,15 +70,12 @@ class Recorder(StoppableNode):
         self._topics = _resolve(self, config.topics)
         self._bag = Bag(Path(config.output or time.strftime("outputs/recording_%Y-%m-%d_%H-%M-%S")))
         self._heard: dict[tuple[Any, ...], Subscription | None] = {}
-        self._begun: set[tuple[str, str]] = set()
-        self._recent: dict[str, deque[tuple[int, int]]] = {topic: deque(maxlen=_DEPTH) for topic in self._topics}
-        self._known: dict[str, set[tuple[int, int]]] = {topic: set() for topic in self._topics}
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self.create_timer(_LOOK, self._look, clock=steady)
-        self.create_timer(_FLUSH, self._flush, clock=steady)
-        self.create_timer(_STATUS, self._tell, clock=steady)
+        self._recent: defaultdict[str, OrderedDict[tuple[int, int], None]] = defaultdict(OrderedDict)
+        self.every(_LOOK, self._look)
+        self.every(_FLUSH, self._flush)
+        self.every(_STATUS, self._tell)
         if config.duration:
-            self.create_timer(config.duration, self._end, clock=steady)
+            self.every(config.duration, self._end)
         self.get_logger().info(f"recording {', '.join(self._topics)} to {self._bag.folder}")
 
     # Who publishes
@@ -126,66 +121,61 @@ class Recorder(StoppableNode):
     # What they publish
 
     def _take(self, topic: str, kind: str, data: bytes, info: dict[str, int]) -> None:
-        if self._bag is None or self.failed or self._seen(topic, info):
+        if self.code or self._seen(topic, info):
             return
-        if (topic, kind) not in self._begun:
-            self._begun.add((topic, kind))
+        if (topic, kind) not in self._bag.connections:
             publishers = self.get_publishers_info_by_topic(topic)
             self._bag.add(topic, kind, [_to_bag(found.qos_profile) for found in publishers if found.topic_type == kind])
             self.get_logger().info(f"{topic}: the first message ({kind})")
-        try:
+        with self._ends_where_it_fails():
             self._bag.write(topic, kind, info["received_timestamp"] or time.time_ns(), data)
-        except UserError as error:
-            self._fail(error)
 
     def _seen(self, topic: str, info: dict[str, int]) -> bool:
         """Whether another subscription brought the same message: kinds of publishers overlap in whom they reach."""
-        recent, known = self._recent[topic], self._known[topic]
+        recent = self._recent[topic]
         key = (info["source_timestamp"], info["publication_sequence_number"])
-        if key in known:
+        if key in recent:
             return True
-        if len(recent) == recent.maxlen:
-            known.discard(recent[0])
-        recent.append(key)
-        known.add(key)
+        recent[key] = None
+        if len(recent) > _DEPTH:
+            recent.popitem(last=False)
         return False
 
     def _flush(self) -> None:
-        if self._bag is not None and not self.failed:
-            try:
+        if not self.code:
+            with self._ends_where_it_fails():
                 self._bag.flush()
-            except UserError as error:
-                self._fail(error)
 
     def _tell(self) -> None:
-        if self._bag is not None:
-            self.get_logger().info(f"{sum(self._bag.counts.values()):,} messages, {self._bag.size / 1e6:.1f} MB")
+        self.get_logger().info(f"{self._bag.counts.total():,} messages, {self._bag.size / 1e6:.1f} MB")
 
     # The end
 
     def _end(self) -> None:
         self.stopped = True
 
-    def _fail(self, error: UserError) -> None:
-        assert self._bag is not None
-        self.failed = self.stopped = True
-        self.get_logger().fatal(f"{error}; -p recover:={self._bag.folder} completes what is there")
+    @contextmanager
+    def _ends_where_it_fails(self) -> Iterator[None]:
+        try:
+            yield
+        except UserError as error:
+            self.code, self.stopped = 1, True
+            self.get_logger().fatal(f"{error}; -p recover:={self._bag.folder} completes what is there")
 
     def finish(self) -> None:
         """Take what has arrived until now, and complete the recording."""
-        if self._bag is None or self.failed:
+        if self.config.recover or self.code:
             return
         until = time.time_ns()
         for (topic, kind, *_), subscription in self._heard.items():
             if subscription is not None:
                 self._drain(topic, kind, subscription, until)
-        try:
+        with self._ends_where_it_fails():
             self._bag.close()
-        except UserError as error:
-            self._fail(error)
+        if self.code:
             return
         for topic in self._topics:
-            self.get_logger().info(f"{topic}: {self._bag.counts.get(topic, 0):,} messages")
+            self.get_logger().info(f"{topic}: {self._bag.counts[topic]:,} messages")
         self._tell()
         self.get_logger().info(f"recorded to {self._bag.folder}")
 
@@ -198,7 +188,7 @@ class Recorder(StoppableNode):
                 self._take(topic, kind, data, info)
 
 
-def _resolve(node: StoppableNode, topics: tuple[str, ...]) -> list[str]:
+def _resolve(node: Recorder, topics: tuple[str, ...]) -> list[str]:
     """Full names, remapped as the user wants."""
     if not topics:
         raise UserError("topics: at least one is needed")
@@ -225,13 +215,7 @@ def _to_bag(offered: QoSProfile) -> Qos:
 
 def main() -> int:
     """Run the node."""
-    made: list[Recorder] = []
-
-    def make() -> Recorder:
-        made.append(Recorder())
-        return made[-1]
-
-    return run(make, "physai.ros.record", __doc__ or "", RecordConfig) or int(any(node.failed for node in made))
+    return run(Recorder, "physai.ros.record", __doc__ or "", RecordConfig)
 
 
 if __name__ == "__main__":

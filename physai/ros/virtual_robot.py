@@ -4,16 +4,13 @@ import sys
 import time
 from dataclasses import dataclass
 
-from rclpy.clock import Clock, ClockType
 from rclpy.time import Time
 from sensor_msgs.msg import JointState as JointStateMessage
 from std_msgs.msg import Float64MultiArray
-from std_srvs.srv import Trigger
 
 from physai.deploy import JointState
 from physai.deploy.parameters import parameter
 from physai.errors import UserError
-from physai.ros.node.parameters import declare
 from physai.ros.node.run import StoppableNode, run
 from physai.ros.topics import qos
 from physai.ros.topics.commands import controller_topic
@@ -43,7 +40,7 @@ class VirtualRobotConfig(FaultConfig):
 _LONGEST_PAUSE = 1.0  # s that the arm makes up for; in a longer one, such as a computer's sleep, it slept, too
 
 
-class VirtualRobot(StoppableNode):
+class VirtualRobot(StoppableNode[VirtualRobotConfig]):
     """Publishes /joint_states, and obeys the commands of its robot's controller as the real one does.
 
     Raises:
@@ -51,8 +48,8 @@ class VirtualRobot(StoppableNode):
     """
 
     def __init__(self) -> None:
-        super().__init__("virtual_robot")
-        config = declare(self, VirtualRobotConfig, self._configure)
+        super().__init__("virtual_robot", VirtualRobotConfig)
+        config = self.config
         self._arm = VirtualArm(
             config.env, config.randomization, config.seed, 1.0 / config.rate_hz, config.overrides, config.physics
         )
@@ -71,12 +68,13 @@ class VirtualRobot(StoppableNode):
         self._states = self.create_publisher(JointStateMessage, "/joint_states", 10)
         commands = controller_topic(self._arm.spec.command)
         self.create_subscription(Float64MultiArray, commands, self._take_command, qos.COMMAND)
-        self.create_service(Trigger, "~/reset", self._reset)
+        self.offer("~/reset", self._reset)
         self._period, self._at = 1.0 / config.rate_hz, time.monotonic()  # of a step, and when the last one ended
-        self.create_timer(self._period, self._step, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self.every(self._period, self._step)
         self.get_logger().info(f"'{self._arm.spec.name}' takes {self._arm.spec.command.value} of {list(joints)}")
 
-    def _configure(self, config: VirtualRobotConfig) -> None:
+    def configure(self, config: VirtualRobotConfig) -> None:
+        """Take other faults, and another timeout."""
         self._faults.config = config
         self._controller.timeout = config.command_timeout
 
@@ -88,11 +86,10 @@ class VirtualRobot(StoppableNode):
                 f"{len(message.data)} numbers for {len(self._order)} joints: inactive until ~/reset"
             )
 
-    def _reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+    def _reset(self) -> tuple[bool, str]:
         self._controller.activate()
         self._arm.reset()
-        response.success, response.message = True, "at home"
-        return response
+        return True, "at home"
 
     def _step(self) -> None:
         now = time.monotonic()

@@ -1,1 +1,1 @@
-"""A robot behind topics as a physics and as a Gymnasium env, for programs that are no node."""
+"""A robot behind topics as a physics, for programs that are no node."""

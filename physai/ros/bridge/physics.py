@@ -78,7 +78,7 @@ class RosPhysics:
         self._finalizer = weakref.finalize(self, self._link.close)  # also when Python ends
         try:
             self._link.wait_ready()
-            self._position, self._velocity = self._link.state(-math.inf, state_timeout)
+            self._state = self._link.state(-math.inf, state_timeout)
         except BaseException:
             self.close()
             raise
@@ -103,7 +103,7 @@ class RosPhysics:
         after = self._link.stop()
         if self._link.reset():
             after = time.monotonic()
-        self._position, self._velocity = self._link.state(after, self._timeout)
+        self._state = self._link.state(after, self._timeout)
         self._drive(state.joint_position[0])
 
     def _drive(self, goal: np.ndarray) -> None:
@@ -121,7 +121,7 @@ class RosPhysics:
             self.step(np.zeros((1, len(way))) if settled else way[None] * min(_GAIN, self._speed / distance))
 
     def _way(self, goal: np.ndarray) -> np.ndarray:
-        way = goal - self._position
+        way = goal - self._state[0]
         return np.where(self._continuous, np.remainder(way + math.pi, 2 * math.pi) - math.pi, way)
 
     def step(self, command: np.ndarray) -> RobotState:
@@ -144,7 +144,7 @@ class RosPhysics:
             if self._deadline < sent:
                 self._deadline = sent + self._dt
             time.sleep(max(0.0, self._deadline - time.monotonic()))
-            self._position, self._velocity = self._link.state(sent, self._timeout)
+            self._state = self._link.state(sent, self._timeout)
         except BaseException:  # Ctrl-C, too
             self._link.stop()
             raise
@@ -152,7 +152,7 @@ class RosPhysics:
 
     def robot_state(self) -> RobotState:
         """See :meth:`physai.physics.Physics.robot_state`."""
-        return RobotState(self._position[None].copy(), self._velocity[None].copy())
+        return RobotState(self._state[:1].copy(), self._state[1:].copy())
 
     def parameters(self) -> DynamicsParameters:
         """Not to be had."""

@@ -7,17 +7,13 @@ import time
 from collections.abc import Sequence
 
 import numpy as np
-import rclpy
 from rclpy.clock import Clock, ClockType
-from rclpy.context import Context
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
-from rclpy.node import Node
-from rclpy.signals import SignalHandlerOptions
+from rclpy.executors import ExternalShutdownException
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 
 from physai.errors import UserError
-from physai.ros.node.run import brief, prepare_middleware
+from physai.ros.node.guest import Guest
 from physai.ros.topics import qos
 from physai.ros.topics.commands import JointCommands
 from physai.signals import Quantity
@@ -49,41 +45,29 @@ class RobotLink:
     def __init__(self, joints: Sequence[str], silence: float, reset_service: str | None, remap: Sequence[str]) -> None:
         self._joints = tuple(joints)
         self._silence = silence
-        self._context = Context()
-        prepare_middleware()
-        rules = [part for rule in remap for part in ("-r", rule)]
-        try:
-            rclpy.init(
-                args=["--ros-args", *rules],
-                context=self._context,
-                signal_handler_options=SignalHandlerOptions.NO,
-            )
-        except RuntimeError as error:  # RCLError
-            raise UserError(brief(error)) from error
-        self._node = Node("physai_env", context=self._context, start_parameter_services=False, enable_rosout=False)
+        self._guest = Guest("physai_env", remap)
+        node = self._guest.node
         self._news = threading.Condition()  # also guards what goes out
         self._received, self._stamp, self._refused = -math.inf, -1, ""
         self._state = np.full((2, len(self._joints)), np.nan)
-        self._sent, self._moving, self._used, self._closed = -math.inf, False, False, False
-        self._commands = JointCommands(self._node, len(self._joints), Quantity.JOINT_VELOCITY)
-        self._states = self._node.create_subscription(
+        self._sent, self._moving, self._closed = -math.inf, False, False
+        self._commands = JointCommands(node, len(self._joints), Quantity.JOINT_VELOCITY)
+        self._states = node.create_subscription(
             JointState,
             "/joint_states",
             self._take,  # type: ignore[arg-type]  # rclpy also takes callbacks with two arguments
             qos.SENSOR,
             event_callbacks=qos.SILENT_SUBSCRIPTION,  # a log line on a stopped terminal would stop _watch, too
         )
-        self._reset = None if reset_service is None else self._node.create_client(Trigger, reset_service)
-        self._node.create_timer(silence / 2, self._watch, clock=Clock(clock_type=ClockType.STEADY_TIME))
-        self._executor = SingleThreadedExecutor(context=self._context)
-        self._executor.add_node(self._node)
+        self._reset = None if reset_service is None else node.create_client(Trigger, reset_service)
+        node.create_timer(silence / 2, self._watch, clock=Clock(clock_type=ClockType.STEADY_TIME))
         self._thread = threading.Thread(target=self._spin, name="physai_env", daemon=True)
         self._thread.start()
         self._started = time.monotonic()
 
     def _spin(self) -> None:
         with contextlib.suppress(ExternalShutdownException):
-            self._executor.spin()
+            self._guest.executor.spin()
 
     def _take(self, message: JointState, info: dict[str, int]) -> None:
         received = qos.received_at(info)
@@ -136,7 +120,7 @@ class RobotLink:
         with self._news:
             if self._closed:
                 raise RobotError("the link to the robot is closed")
-            self._used, self._moving = True, any(velocity)
+            self._moving = any(velocity)
             self._sent = time.monotonic()
             self._commands.send(velocity)
             return self._sent
@@ -164,30 +148,25 @@ class RobotLink:
         """
         if self._reset is None or not self._reset.service_is_ready():
             return False
-        name, done = self._reset.service_name, threading.Event()
-        future = self._reset.call_async(Trigger.Request())
-        future.add_done_callback(lambda _: done.set())
-        if not done.wait(_PATIENCE):
-            raise RobotError(f"{name} did not answer within {_PATIENCE:g} s")
-        if not future.result().success:
-            raise RobotError(f"{name} failed: {future.result().message}")
+        answer = self._reset.call(Trigger.Request(), _PATIENCE)
+        if answer is None:
+            raise RobotError(f"{self._reset.service_name} did not answer within {_PATIENCE:g} s")
+        if not answer.success:
+            raise RobotError(f"{self._reset.service_name} failed: {answer.message}")
         return True
 
     def close(self) -> None:
-        """Stop the robot, surely, and leave ROS; may be called twice."""
-        if not self._context.ok():
-            return
+        """Stop the robot, surely, and leave ROS."""
         try:
             with self._news:
                 self._closed = True  # nobody speaks after the last zeros
-                if self._used:
+                if self._sent > -math.inf:  # else another one may drive it
                     self._commands.finish()
         finally:
-            self._executor.shutdown(timeout_sec=1.0)
+            self._guest.executor.shutdown(timeout_sec=1.0)
             if threading.current_thread() is not self._thread:  # the garbage collector runs in any thread
                 self._thread.join(1.0)
-            self._node.destroy_node()
-            self._context.try_shutdown()
+            self._guest.close()
 
 
 def _read(message: JointState, joints: tuple[str, ...]) -> np.ndarray | str:

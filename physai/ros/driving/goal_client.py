@@ -3,21 +3,16 @@
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from types import TracebackType
 
 import numpy as np
-import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from rclpy.context import Context
-from rclpy.executors import SingleThreadedExecutor
-from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 
 from physai.deploy import Policy, State
 from physai.errors import UserError
 from physai.ros.driving.processes import NodeProcess
-from physai.ros.node.run import prepare_middleware
+from physai.ros.node.guest import Guest
 from physai.ros.topics import goals, qos
 from physai.ros.topics.commands import controller_topic
 from physai.signals import Tolerance
@@ -103,12 +98,8 @@ class GoalClient:
         self._metadata = policy.metadata
         self._state = ""
         self._stopped = ""
-        prepare_middleware()
-        self._context = Context()
-        rclpy.init(context=self._context, signal_handler_options=SignalHandlerOptions.NO)
-        self._node = rclpy.create_node("goal_client", context=self._context)
-        self._executor = SingleThreadedExecutor(context=self._context)
-        self._executor.add_node(self._node)
+        self._guest = Guest("goal_client")
+        self._node = self._guest.node
         self._goals = self._node.create_publisher(goals.goal_type(policy.metadata.goal), "/inference_node/goal", 1)
         self._node.create_subscription(JointState, "/joint_states", self._take_joint_state, qos.SENSOR)
         self._node.create_subscription(String, "/inference_node/state", self._take_state, qos.LATCHED)
@@ -122,7 +113,7 @@ class GoalClient:
         """
         end = time.monotonic() + _LOOK
         while time.monotonic() < end:
-            self._executor.spin_once(0.05)
+            self._guest.executor.spin_once(0.05)
             commands = controller_topic(self._metadata.command.quantity)
             for name, others in (
                 (commands, self._node.count_subscribers(commands) + self._node.count_publishers(commands)),
@@ -138,10 +129,9 @@ class GoalClient:
             UserError: If they do not come.
         """
         ready = (State.WAITING.value, State.REACHED.value)
-        self._spin(
-            lambda: bool(self.record.times) and self._state in ready and self._goals.get_subscription_count(), _START
-        )
-        if not self.record.times or self._state not in ready:
+        if not self._spin(
+            lambda: self.record.times and self._state in ready and self._goals.get_subscription_count(), _START
+        ):
             raise UserError(f"the nodes do not work: joint states: {bool(self.record.times)}, state: '{self._state}'")
 
     def send(self, goal: np.ndarray, hold: float) -> GoalResult:
@@ -169,7 +159,7 @@ class GoalClient:
     def _spin(self, done: Callable[[], object], seconds: float) -> bool:
         end = time.monotonic() + seconds
         while time.monotonic() < end:
-            self._executor.spin_once(0.05)
+            self._guest.executor.spin_once(0.05)
             if done():
                 return True
             if self._stopped:
@@ -190,10 +180,6 @@ class GoalClient:
     def _take_diagnostics(self, message: DiagnosticArray) -> None:
         self._stopped = next((s.message for s in message.status if s.level == DiagnosticStatus.ERROR), "")
 
-    def __enter__(self) -> "GoalClient":
-        return self
-
-    def __exit__(self, kind: type | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        self._executor.shutdown(timeout_sec=1.0)
-        self._node.destroy_node()
-        self._context.try_shutdown()
+    def close(self) -> None:
+        """Leave ROS."""
+        self._guest.close()

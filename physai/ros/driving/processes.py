@@ -1,13 +1,11 @@
 """Nodes in processes of their own, which end with this one."""
 
-import contextlib
 import os
 import signal
 import subprocess
 import sys
 from functools import partial
 from pathlib import Path
-from types import TracebackType
 
 from physai.processes import die_with
 
@@ -52,9 +50,8 @@ class NodeProcess:
     def __enter__(self) -> "NodeProcess":
         return self
 
-    def __exit__(self, kind: type | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        with contextlib.suppress(ProcessLookupError):
-            self._process.terminate()
+    def __exit__(self, *_: object) -> None:
+        self._process.terminate()
         try:
             self._process.wait(_PATIENCE)
         except subprocess.TimeoutExpired:

@@ -5,9 +5,9 @@ import threading
 import time
 from pathlib import Path
 
-from physai.files import sync_folder
+from physai.files import sync_folder, write_atomically
 
-_CREATED = 0.01  # s that a stop may wait for its file, behind the zeros
+_DISK = 0.01  # s that a stop may wait for the disk, behind the zeros
 _RETRY = 1.0  # s
 
 
@@ -34,12 +34,13 @@ class EmergencyStopFile:
         self.path = Path(os.devnull)
         try:
             self.path = _folder() / f"domain_{domain}{node.replace('/', '.')}.estop"
-            self.path.parent.mkdir(parents=True, exist_ok=True)
             self.stopped = os.path.lexists(self.path)
-            _try(self.path.with_name(f"{self.path.name}.{os.getpid()}"))
+            trial = self.path.with_name(f"{self.path.name}.{os.getpid()}")
+            write_atomically(trial, b"whether an emergency stop could be remembered\n")
+            trial.unlink()
         except (OSError, RuntimeError) as error:  # RuntimeError: who has no home
             self.unusable = _why(error, self.path)
-        self._wanted = self._there = self.stopped
+        self._wanted = self.stopped
         self._synced: bool | None = self.stopped  # what the disk holds for sure; None: it may be either
         self._changed = threading.Condition()
         self._ended = False
@@ -53,7 +54,7 @@ class EmergencyStopFile:
                 return
             self._wanted = True
             self._changed.notify_all()
-            self._changed.wait_for(lambda: self._there, _CREATED)
+            self._changed.wait_for(lambda: self._synced, _DISK)
 
     def forget(self) -> None:
         """Have the file removed."""
@@ -75,57 +76,36 @@ class EmergencyStopFile:
                 wanted = self._wanted
                 if wanted == self._synced:
                     return
-            self._synced = None
+                self._synced = None
             try:
                 self._write(wanted)
                 self._synced, self.failure = wanted, ""
             except OSError as error:
                 self.failure = _why(error, self.path)
                 self.failures += 1
-                with self._changed:
+            with self._changed:
+                self._changed.notify_all()
+                if self.failure:
                     if self._ended:
                         return
-                    self._changed.wait_for(lambda: self._ended, _RETRY)
+                    self._changed.wait_for(lambda: self._ended, _RETRY)  # and try for a last time
 
     def _write(self, stopped: bool) -> None:
         if stopped:
             self.path.parent.mkdir(parents=True, exist_ok=True)
             with open(self.path, "w") as file:
-                self._notice(True)
                 file.write(f"emergency stop at {time.strftime('%Y-%m-%d %H:%M:%S')}, until ~/reset\n")
                 file.flush()
                 os.fsync(file.fileno())
         else:
             self.path.unlink(missing_ok=True)
-            self._notice(False)
         sync_folder(self.path.parent)
-
-    def _notice(self, there: bool) -> None:
-        with self._changed:
-            self._there = there
-            self._changed.notify_all()
 
 
 def _folder() -> Path:
     """Where programs of this user keep what they have to remember (XDG Base Directory Specification)."""
     given = Path(os.environ.get("XDG_STATE_HOME", ""))
     return (given if given.is_absolute() else Path.home() / ".local" / "state") / "physai"
-
-
-def _try(path: Path) -> None:
-    """See that a file can be written here.
-
-    Raises:
-        OSError: If not.
-    """
-    try:
-        with open(path, "w") as file:
-            file.write("whether an emergency stop could be remembered\n")
-            file.flush()
-            os.fsync(file.fileno())
-        sync_folder(path.parent)
-    finally:
-        path.unlink(missing_ok=True)
 
 
 def _why(error: Exception, path: Path) -> str:

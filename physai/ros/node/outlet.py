@@ -9,6 +9,7 @@ import contextlib
 import fcntl
 import io
 import os
+import queue
 import select
 import sys
 import threading
@@ -16,7 +17,8 @@ import time
 from collections.abc import Iterator, Sequence
 from typing import Any
 
-_ROOM = 2**16  # bytes that may wait for a slow reader, some 600 lines
+_ROOM = 500  # lines that may wait for a slow reader
+_LONGEST = 512  # bytes of a line; what a longer one has beyond them counts as another
 _PIPE = 2**20  # bytes of the pipe, for bursts
 _PATIENCE = 0.5  # s for what still waits when a node ends
 
@@ -64,13 +66,9 @@ class Outlet:
 
     Args:
         numbers: Descriptors that lead to the same place.
-
-    Attributes:
-        dropped: Lines that have been lost.
     """
 
     def __init__(self, numbers: Sequence[int]) -> None:
-        self.dropped = 0
         self._numbers = numbers
         self._real = os.dup(numbers[0])
         self._source, pipe = os.pipe()
@@ -80,14 +78,16 @@ class Outlet:
         for number in numbers:
             os.dup2(pipe, number)
         os.close(pipe)
-        self._changed = threading.Condition()
-        self._lines: list[bytes] = []
-        self._size = 0  # bytes of these lines
-        self._lost = 0  # lines that came behind them
-        self._ended = False
+        self._unread, self._unwritten = 0, 0
+        self._lines: queue.Queue[tuple[int, bytes]] = queue.Queue(_ROOM)  # each behind so many lost ones
         self._writer = threading.Thread(target=self._pass_on, name="outlet", daemon=True)
         self._writer.start()
         threading.Thread(target=self._take, name="outlet, in", daemon=True).start()
+
+    @property
+    def dropped(self) -> int:
+        """Lines that have been lost."""
+        return self._unread + self._unwritten
 
     def close(self) -> None:
         """Take nothing any more."""
@@ -101,85 +101,46 @@ class Outlet:
         self._writer.join(max(0.0, timeout))
 
     def _take(self) -> None:
-        rest = b""
-        while data := os.read(self._source, 2**16):
-            *lines, rest = (rest + data).split(b"\n")
-            if len(rest) > _ROOM:
-                lines, rest = [*lines, rest], b""
-            self._queue(lines)
-        self._queue([rest] if rest else [])
-        with self._changed:
-            self._ended = True
-            self._changed.notify()
-
-    def _queue(self, lines: list[bytes]) -> None:
-        with self._changed:
-            for line in lines:
-                # After a lost one all are, until there is room again: one gap, and it can be said where it is.
-                if self._lost or self._size + len(line) > _ROOM:
-                    self._lost += 1
-                    self.dropped += 1
+        lost = 0
+        with open(self._source, "rb") as source:
+            for line in iter(lambda: source.readline(_LONGEST), b""):
+                # After a lost one all are, until none waits any more: one gap, and it can be said where it is.
+                if self._lines.full() or (lost and not self._lines.empty()):
+                    lost += 1
+                    self._unread += 1
                 else:
-                    self._lines.append(line + b"\n")
-                    self._size += len(line) + 1
-            self._changed.notify()
+                    self._lines.put((lost, line))
+                    lost = 0
+        self._lines.put((lost, b""))  # the end
 
     def _pass_on(self) -> None:
         untold = 0
         while True:
-            with self._changed:
-                self._changed.wait_for(lambda: self._lines or self._lost or self._ended)
-                if not self._lines and not self._lost:
-                    return
-                lines, lost = self._lines, self._lost
-                self._lines, self._size, self._lost = [], 0, 0
-            unwritten = self._write(_gap(untold) + b"".join(lines) + _gap(lost))
-            if not unwritten:
-                untold = 0
-                continue
-            failed = min(len(lines), unwritten.count(b"\n"))
-            untold += failed + lost
-            with self._changed:
-                self.dropped += failed
+            lost, line = self._lines.get()
+            untold += lost
+            written = self._write(_gap(untold) + line)
+            if not line:
+                return
+            untold = 0 if written else untold + 1
+            self._unwritten += not written
 
-    def _write(self, data: bytes) -> bytes:
-        """Return what could not be written: a full disk, or a reader that has gone, is no reason to end."""
+    def _write(self, data: bytes) -> bool:
+        """Return whether all could be written: a full disk, or a reader that has gone, is no reason to end."""
         while data:
             try:
                 data = data[os.write(self._real, data) :]
             except BlockingIOError:  # another program has made it so
-                waiting = select.poll()
-                waiting.register(self._real, select.POLLOUT)
-                waiting.poll()
+                select.select([], [self._real], [])
             except OSError:
-                break
-        return data
+                return False
+        return True
 
 
 def _gap(lines: int) -> bytes:
     return f"[WARN] {lines} lines of this output are missing here: they were not taken in time\n".encode() * (lines > 0)
 
 
-class _Descriptor(io.RawIOBase):
-    """Writes what there is room for, and never fails."""
-
-    def __init__(self, number: int) -> None:
-        self._number = number
-
-    def writable(self) -> bool:
-        return True
-
-    def fileno(self) -> int:
-        return self._number
-
-    def write(self, data: Any) -> int:
-        with contextlib.suppress(OSError):
-            rest = memoryview(data)
-            while rest:
-                rest = rest[os.write(self._number, rest) :]
-        return len(data)
-
-
 def _text(number: int) -> io.TextIOWrapper:
-    descriptor: Any = _Descriptor(number)  # which is as good as a buffered writer here: there is nothing to wait for
+    # Nothing between: a write that finds no room returns at once, and there is nothing to wait for at the end.
+    descriptor: Any = io.FileIO(number, "w", closefd=False)
     return io.TextIOWrapper(descriptor, "utf-8", "backslashreplace", line_buffering=True)

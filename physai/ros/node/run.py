@@ -10,19 +10,21 @@ import traceback
 from abc import abstractmethod
 from collections.abc import Callable, Mapping
 from importlib.resources import files
+from typing import Generic
 
 import rclpy
+from rclpy.clock import Clock, ClockType
 from rclpy.exceptions import ParameterException
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
+from std_srvs.srv import Trigger
 
-from physai.deploy.parameters import Parameters
 from physai.errors import UserError
 from physai.ros.node import signals
 from physai.ros.node.outlet import outlets
-from physai.ros.node.parameters import help_text
+from physai.ros.node.parameters import P, declare, help_text
 
 # Jazzy's Fast DDS (2.14) reads the first, later ones the second.
 _PROFILES = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")
@@ -31,21 +33,55 @@ _LAST_DOMAIN = 232  # that has numbers for its ports
 _NO_LOG_FILES = ["--ros-args", "--disable-external-lib-logs", "--"]
 
 
-class StoppableNode(Node):
-    """A node that knows how to end.
+class StoppableNode(Node, Generic[P]):
+    """A node that has parameters, answers, does something periodically, and knows how to end.
+
+    Args:
+        name: Of the node.
+        kind: Its parameters.
 
     Attributes:
+        config: The values of the parameters, as they are now.
         stopped: Set it to end the program.
+        code: The exit code.
+
+    Raises:
+        UserError: If a parameter is wrong.
     """
 
-    stopped = False
+    stopped, code = False, 0
+
+    def __init__(self, name: str, kind: type[P]) -> None:
+        super().__init__(name)
+        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self.config = declare(self, kind, self._change)
+
+    def _change(self, config: P) -> None:
+        self.configure(config)
+        self.config = config
+
+    def configure(self, config: P) -> None:
+        """Take other values while the node runs; may raise a UserError, and then must change nothing."""
+
+    def every(self, period: float, work: Callable[[], None]) -> None:
+        """Call something once a period, s; neither a paused simulation nor a change of the time of day stops it."""
+        self.create_timer(period, work, clock=self._steady)
+
+    def offer(self, service: str, act: Callable[[], tuple[bool, str]]) -> None:
+        """Offer a std_srvs/Trigger service: what it does returns whether it could, and a message."""
+
+        def answer(_: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+            response.success, response.message = act()
+            return response
+
+        self.create_service(Trigger, service, answer)
 
     @abstractmethod
     def finish(self) -> None:
         """Leave the robot standing, or the file complete; no callback comes after it."""
 
 
-def run(make_node: Callable[[], StoppableNode], module: str, about: str, kind: type[Parameters]) -> int:
+def run(make_node: Callable[[], StoppableNode[P]], module: str, about: str, kind: type[P]) -> int:
     """Run a node until a signal, its own wish or an exception ends it.
 
     ROS' own signal handlers close the context before anything can be published; ours only end the loop.
@@ -57,7 +93,8 @@ def run(make_node: Callable[[], StoppableNode], module: str, about: str, kind: t
         kind: Its parameters, for the help text.
 
     Returns:
-        The exit code: 0 after a signal or by its own wish, 1 after an exception, 2 if the user's input was wrong.
+        The exit code: 0 after a signal or by its own wish (or what the node says), 1 after an exception, 2 if the
+        user's input was wrong.
     """
     caught = signals.catch()
     parser = argparse.ArgumentParser(
@@ -67,21 +104,11 @@ def run(make_node: Callable[[], StoppableNode], module: str, about: str, kind: t
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     try:
-        arguments = remove_ros_args(sys.argv)[1:]
-    except RuntimeError as error:  # RCLError: such as a file of parameters that does not exist
-        return _refuse(brief(error))
-    parser.parse_args(arguments)
-    try:
+        parser.parse_args(remove_ros_args(sys.argv)[1:])
         prepare_middleware()
-    except UserError as error:
-        return _refuse(str(error))
+    except (RuntimeError, UserError) as error:  # RCLError: such as a file of parameters that does not exist
+        return _refuse(brief(error))
     with outlets():
-        try:
-            rclpy.init(
-                args=[*sys.argv[:1], *_NO_LOG_FILES, *sys.argv[1:]], signal_handler_options=SignalHandlerOptions.NO
-            )
-        except RuntimeError as error:  # RCLError
-            return _refuse(_of_ros(error))
         try:
             return _run(make_node, caught)
         finally:
@@ -104,8 +131,9 @@ def prepare_middleware() -> None:
         os.environ.setdefault("FASTDDS_BUILTIN_TRANSPORTS", "UDPv4")  # beyond LOCALHOST, where ROS chooses for itself
 
 
-def _run(make_node: Callable[[], StoppableNode], caught: Mapping[int, object]) -> int:
+def _run(make_node: Callable[[], StoppableNode[P]], caught: Mapping[int, object]) -> int:
     try:
+        rclpy.init(args=[*sys.argv[:1], *_NO_LOG_FILES, *sys.argv[1:]], signal_handler_options=SignalHandlerOptions.NO)
         node = make_node()
     except (UserError, ParameterException) as error:  # such as a use_sim_time that is no bool
         return _refuse(str(error))
@@ -118,14 +146,14 @@ def _run(make_node: Callable[[], StoppableNode], caught: Mapping[int, object]) -
     gc.freeze()  # to look for garbage in all that is imported would hold up every command for a tenth of a second
     executor = SingleThreadedExecutor()
     executor.add_node(node)
-    code, last_words = 0, ""
+    last_words = ""
     try:
         while not node.stopped and not caught:
             executor.spin_once(timeout_sec=0.1)
     except UserError as error:
-        code, last_words = 2, str(error)
+        node.code, last_words = 2, str(error)
     except Exception as error:
-        code, last_words = 1, f"{type(error).__name__} ends this node: {error}\n{traceback.format_exc()}"
+        node.code, last_words = 1, f"{type(error).__name__} ends this node: {error}\n{traceback.format_exc()}"
     finally:
         node.finish()  # before anything else
     log = node.get_logger()
@@ -135,7 +163,7 @@ def _run(make_node: Callable[[], StoppableNode], caught: Mapping[int, object]) -
         log.info(f"{signal.Signals(next(iter(caught))).name} ends this node" if caught else "this node ends")
     executor.shutdown(timeout_sec=1.0)
     node.destroy_node()
-    return code
+    return node.code
 
 
 def _of_ros(error: Exception) -> str:

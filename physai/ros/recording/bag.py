@@ -4,6 +4,7 @@ import contextlib
 import fcntl
 import os
 import struct
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -33,6 +34,7 @@ class Bag:
         folder: Is made, with its parents.
 
     Attributes:
+        connections: Topics, with the types of their messages, that there is place for.
         counts: Messages written, by topic.
         size: Bytes of messages written.
 
@@ -42,13 +44,13 @@ class Bag:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        self.counts: dict[str, int] = {}
+        self.counts: Counter[str] = Counter()
         self.size = 0
-        self._connections: dict[tuple[str, str], Connection] = {}
+        self.connections: dict[tuple[str, str], Connection] = {}
         if folder.exists():
             raise UserError(f"{folder} exists already")
         with _clearly(folder):
-            self._writer = _writer(folder)
+            self._writer = Writer(folder, version=Writer.VERSION_LATEST, storage_plugin=StoragePlugin.MCAP)
             self._writer.open()
             fcntl.flock(self._storage.bio, fcntl.LOCK_EX)  # against a recovery of what is not dead
             self._storage.bio.flush()
@@ -58,17 +60,15 @@ class Bag:
         return cast(McapWriter, self._writer.storage)
 
     def add(self, topic: str, kind: str, offered: Sequence[Qos] = ()) -> None:
-        """Make place for messages of a type in :data:`TYPES`, unless there is one."""
-        if (topic, kind) not in self._connections:
-            self._connections[topic, kind] = self._writer.add_connection(
-                topic, kind, typestore=TYPES, offered_qos_profiles=offered
-            )
-            self.counts.setdefault(topic, 0)
+        """Make place for messages of a type in :data:`TYPES`."""
+        self.connections[topic, kind] = self._writer.add_connection(
+            topic, kind, typestore=TYPES, offered_qos_profiles=offered
+        )
 
     def write(self, topic: str, kind: str, stamp: int, data: bytes) -> None:
         """Write a message: the time at which it came, ns, and its CDR, as the wire has it."""
         with _clearly(self.folder):
-            self._writer.write(self._connections[topic, kind], stamp, data)
+            self._writer.write(self.connections[topic, kind], stamp, data)
         self.counts[topic] += 1
         self.size += len(data)
 
@@ -102,27 +102,17 @@ def recover(folder: Path) -> int:
     with _clearly(folder), TemporaryDirectory(dir=folder) as temporary:
         torn, whole, bag = files[0], Path(temporary) / "whole.mcap", Path(temporary) / files[0].stem
         _copy_whole_records(torn, whole)
-        with Reader(whole) as reader, _writer(bag) as writer:
-            copies = {
-                old.id: writer.add_connection(
-                    old.topic,
-                    old.msgtype,
-                    typestore=TYPES,
-                    offered_qos_profiles=cast(ConnectionExtRosbag2, old.ext).offered_qos_profiles,
-                )
-                for old in reader.connections
-            }
+        with Reader(whole) as reader:
+            copy = Bag(bag)
+            for old in reader.connections:
+                copy.add(old.topic, old.msgtype, cast(ConnectionExtRosbag2, old.ext).offered_qos_profiles)
             # Without an index, Reader.messages insists on their order, which several topics need not have.
             for old, stamp, data in cast(McapReader, reader.storage).messages_scan(reader.connections):
-                writer.write(copies[old.id], stamp, data)
-            count = reader.message_count
+                copy.write(old.topic, old.msgtype, stamp, data)
+            copy.close()
         os.replace(bag / torn.name, torn)
         os.replace(bag / "metadata.yaml", folder / "metadata.yaml")  # last: it says that the rest is done
-    return count
-
-
-def _writer(folder: Path) -> Writer:
-    return Writer(folder, version=Writer.VERSION_LATEST, storage_plugin=StoragePlugin.MCAP)
+    return copy.counts.total()
 
 
 def _copy_whole_records(torn: Path, whole: Path) -> None:

@@ -27,7 +27,7 @@ class JointCommands:
 
     Args:
         node: Whose remaps hold.
-        joints: How many numbers a command has.
+        joints: How many numbers a command has; 0 where that is not known yet.
         quantity: What they are, joint velocities or joint positions.
         topic: Where to; None for the controller itself.
         partners: Who publishes this other topic may publish here, too; empty if nobody may.
@@ -46,19 +46,13 @@ class JointCommands:
     def __init__(
         self, node: Node, joints: int, quantity: Quantity, topic: str | None = None, partners: str = ""
     ) -> None:
-        self._stops_at_zero = quantity is Quantity.JOINT_VELOCITY
+        self.still = [0.0] * joints if joints and quantity is Quantity.JOINT_VELOCITY else None
         self._publisher = node.create_publisher(
             Float64MultiArray, topic or controller_topic(quantity), qos.COMMAND, event_callbacks=qos.SILENT_PUBLISHER
         )
         self.topic: str = self._publisher.topic_name
         self._companions = Companions(node, self.topic, partners)
         self._message = Float64MultiArray()
-        self.resize(joints)
-
-    def resize(self, joints: int) -> None:
-        """Take another number of joints in a command."""
-        self._message.data = array("d", [0.0] * joints)
-        self.still = [0.0] * joints if self._stops_at_zero else None
 
     @property
     def rival(self) -> str | None:
@@ -77,8 +71,7 @@ class JointCommands:
 
     def send(self, command: Sequence[float]) -> None:
         """Publish a command."""
-        for index, value in enumerate(command):
-            self._message.data[index] = value
+        self._message.data = array("d", command)
         self._publisher.publish(self._message)
 
     def stop(self) -> None:

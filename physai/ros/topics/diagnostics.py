@@ -1,5 +1,7 @@
 """What the inference node tells about itself on /diagnostics (diagnostic_msgs, REP-107)."""
 
+from collections import deque
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -8,10 +10,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 
 from physai.deploy import Policy, State
 
-_LEVELS = {
-    State.WAITING.value: DiagnosticStatus.OK,
-    State.ACTIVE.value: DiagnosticStatus.OK,
-    State.REACHED.value: DiagnosticStatus.OK,
+_TROUBLE = {
     State.HOLD.value: DiagnosticStatus.WARN,
     State.FAULT.value: DiagnosticStatus.ERROR,
     State.ESTOP.value: DiagnosticStatus.ERROR,
@@ -23,39 +22,36 @@ class Timing:
 
     Args:
         length: How many are looked at.
-
-    Attributes:
-        last: Time of the last update, s.
     """
 
     def __init__(self, length: int = 100) -> None:
-        self.last = -np.inf
-        self._periods = np.full(length, np.nan)
-        self._next = 0
+        self._times: deque[float] = deque(maxlen=length + 1)
 
     def tick(self, now: float) -> None:
         """Count an update at a time, s."""
-        if np.isfinite(self.last):
-            self._periods[self._next] = now - self.last
-            self._next = (self._next + 1) % len(self._periods)
-        self.last = now
+        self._times.append(now)
 
     def summary(self) -> dict[str, float | None]:
         """Mean rate, Hz, and the longest distance of a period from the mean, ms; None before the second update."""
-        periods = self._periods[np.isfinite(self._periods)]
+        periods = np.diff(self._times)
         if not len(periods):
             return {"rate_hz": None, "jitter_ms": None}
         mean = periods.mean()
         return {"rate_hz": round(1.0 / mean, 2), "jitter_ms": round(1e3 * float(np.abs(periods - mean).max()), 3)}
 
 
+def summary(state: str, reasons: Sequence[str]) -> str:
+    """Say in one line what a controller does, and why."""
+    return f"{state}: {'; '.join(reasons)}" if reasons else state
+
+
 def diagnose(name: str, stamp: Time, policy: Policy, values: dict[str, Any]) -> DiagnosticArray:
     """Make the message from ``values``: a controller's snapshot, and whatever else is to be told."""
     flat = {**values, **{f"count: {key}": count for key, count in sorted(values["counters"].items())}}
     status = DiagnosticStatus(
-        level=_LEVELS[values["state"]],
+        level=_TROUBLE.get(values["state"], DiagnosticStatus.OK),
         name=f"{name}: arm",
-        message=": ".join([values["state"], "; ".join(values["reasons"])][: 2 if values["reasons"] else 1]),
+        message=summary(values["state"], values["reasons"]),
         hardware_id=policy.metadata.robot,
         values=[
             KeyValue(key=key, value="" if value is None else str(value))

@@ -37,7 +37,6 @@ class WatchedCommands(JointCommands):
             qos.SENSOR,
         )
         self.timeout = timeout
-        self.silences = 0
         self._name = watchdog
         self._last = -math.inf
         self._answering = False

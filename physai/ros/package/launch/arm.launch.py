@@ -16,21 +16,16 @@ def generate_launch_description() -> LaunchDescription:
         [
             DeclareLaunchArgument("policy_path", description="policy.pt of a run"),
             DeclareLaunchArgument("params_file", default_value=parameters, description="parameters of all nodes"),
-            DeclareLaunchArgument(
-                "use_virtual_robot",
-                default_value="false",
-                choices=["true", "false"],
-                description="instead of a real one",
-            ),
-            DeclareLaunchArgument(
-                "use_watchdog",
-                default_value="true",
-                choices=["true", "false"],
-                description="a relay that stops the arm when commands stop",
-            ),
+            switch("use_virtual_robot", "false", "instead of a real one"),
+            switch("use_watchdog", "true", "a relay that stops the arm when commands stop"),
             OpaqueFunction(function=make_nodes),
         ]
     )
+
+
+def switch(name: str, default: str, description: str) -> DeclareLaunchArgument:
+    """Return an argument that is true or false."""
+    return DeclareLaunchArgument(name, default_value=default, choices=["true", "false"], description=description)
 
 
 def make_nodes(context: LaunchContext) -> list[Node]:
@@ -41,13 +36,8 @@ def make_nodes(context: LaunchContext) -> list[Node]:
     )
     watchdog = {"watchdog": WATCHDOG} if use_watchdog == "true" else {}
     node = {"package": "physai", "output": "screen"}
-    nodes = [
-        Node(
-            executable="inference_node",
-            parameters=[params_file, {"policy_path": policy_path} | watchdog],
-            **node,
-        )
-    ]
+    policy = {"policy_path": policy_path} | watchdog
+    nodes = [Node(executable="inference_node", parameters=[params_file, policy], **node)]
     if use_watchdog == "true":
         nodes.append(Node(executable="command_watchdog", parameters=[params_file], **node))
     if use_virtual_robot == "true":
