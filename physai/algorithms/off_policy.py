@@ -5,7 +5,6 @@ from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from torch import Tensor
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LRScheduler
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
@@ -13,8 +12,8 @@ from torchrl.data.replay_buffers import RandomSampler
 from torchrl.objectives import DDPGLoss, TargetNetUpdater, TD3Loss
 from torchrl.objectives.utils import ValueEstimators
 
+from physai.algorithms.gradient import GradientAlgorithm, check_ranges
 from physai.algorithms.interface import Networks
-from physai.algorithms.loss_optimizer import LossOptimizer, check_ranges
 from physai.algorithms.proportional import ProportionalSampler
 from physai.config import Count, NonNegativeFloat, PositiveFloat
 from physai.errors import UserError
@@ -23,7 +22,7 @@ _RAW, _NORMALIZED = "observation", "normalized_observation"
 _MADE_LATER = {("priority_weight",), ("next", "action")}  # by the buffer and by the loss
 
 
-class OffPolicy:
+class OffPolicy(GradientAlgorithm):
     """An off-policy actor-critic algorithm, put together from TorchRL parts (``conf/algo/sac.yaml``).
 
     It is a :class:`physai.algorithms.Algorithm`. The buffer keeps raw observations: they are normalized when they are
@@ -72,22 +71,22 @@ class OffPolicy:
             )
         _check_buffer(buffer, frames_per_batch)
         try:
-            self.loss = loss(networks.actor, networks.critic)
+            made = loss(networks.actor, networks.critic)
         except ValueError as error:
             raise UserError(f"algo.loss: {error}") from error
         except (AttributeError, IndexError) as error:  # no get_dist, or no log_prob_keys
             name = type(networks.actor).__name__
             raise UserError(f"policy.actor: this loss draws from a distribution, and {name} has none") from error
-        if (drawn := getattr(self.loss.tensor_keys, "action", "action")) != "action":
+        if (drawn := getattr(made.tensor_keys, "action", "action")) != "action":
             raise UserError(f"policy.actor: this loss would learn from '{drawn}', and the critic judges 'action'")
         judged = {_path(key) for key in networks.critic.in_keys}
-        if isinstance(self.loss, TD3Loss) and (unseen := judged - {("action",), *map(_path, networks.actor.in_keys)}):
+        if isinstance(made, TD3Loss) and (unseen := judged - {("action",), *map(_path, networks.actor.in_keys)}):
             raise UserError(f"policy.critic.in_keys: in TD3Loss it sees what the actor sees, not '{min(unseen)[0]}'")
-        self.loss.make_value_estimator(ValueEstimators.TD0, gamma=gamma)
-        check_ranges("algo", self.loss.value_estimator)
+        made.make_value_estimator(ValueEstimators.TD0, gamma=gamma)
+        check_ranges("algo", made.value_estimator)
+        super().__init__(made, optimizer, scheduler, max_grad_norm)
         self._squared = isinstance(self.loss, TD3Loss | DDPGLoss)  # so is the error that these report
         self._target = target(self.loss)
-        self.optimizer = LossOptimizer(self.loss, optimizer, scheduler, max_grad_norm)
         self.warmup_frames = warmup_frames
         self.buffer = buffer
         self.minibatch_size = minibatch_size
@@ -128,7 +127,7 @@ class OffPolicy:
             if learning:
                 self._steps += 1
                 leave_out = "loss_actor" if self._steps % self._actor_every else ""
-                figures.set("grad_norm", self.optimizer.step(losses, minibatch, leave_out))
+                figures.set("grad_norm", self.step(losses, minibatch, leave_out))
                 self._target.step()
             else:
                 figures.set("grad_norm", torch.zeros(()))
@@ -138,18 +137,14 @@ class OffPolicy:
             errors = torch.cat(priorities)
             self.buffer.update_priority(drawn.get("index"), errors.sqrt() if self._squared else errors)
         means: TensorDictBase = torch.stack(results).mean(dim=0)
-        return {key: float(value) for key, value in means.items()} | {"lr": self.optimizer.end_batch()}
-
-    def weights(self) -> dict[str, Tensor]:
-        """All weights by name, target networks included."""
-        return self.optimizer.weights()
+        return {key: float(value) for key, value in means.items()} | {"lr": self.end_batch()}
 
     def state(self) -> dict[str, Any]:
         """Return what ``set_state`` needs to go on bit for bit: all frames in the buffer, too."""
         held = len(self.buffer)
-        frames = self.buffer.storage.get(range(held)) if held else TensorDict({}, [0])
+        frames = self.buffer.storage.get(range(held)) if held else {}
         return {
-            **self.optimizer.state(),
+            **super().state(),
             "frames": {".".join(key): frames.get(key).clone() for key in self._keys} if held else {},
             "writer": self.buffer.writer.state_dict(),
             "seen": self._seen,
@@ -160,13 +155,10 @@ class OffPolicy:
 
     def set_state(self, state: dict[str, Any]) -> None:
         """Restore what ``state`` returned."""
-        self.optimizer.set_state(state)
+        super().set_state(state)
         self.buffer.empty()
         if state["frames"]:
-            held = TensorDict({}, [len(next(iter(state["frames"].values())))])
-            for name, values in state["frames"].items():
-                held.set(tuple(name.split(".")), values)
-            self.buffer.extend(held)
+            self.buffer.extend(TensorDict(state["frames"]).auto_batch_size_(1).unflatten_keys("."))
         self.buffer.writer.load_state_dict(state["writer"])
         self.buffer.sampler.load_state_dict(state["sampler"])
         self._seen, self._steps = state["seen"], state["steps"]

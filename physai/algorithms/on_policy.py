@@ -10,13 +10,13 @@ from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LRScheduler
 from torchrl.data import TensorDictReplayBuffer
 
+from physai.algorithms.gradient import GradientAlgorithm, check_ranges
 from physai.algorithms.interface import Networks
-from physai.algorithms.loss_optimizer import LossOptimizer, check_ranges
 from physai.config import Count, PositiveFloat
 from physai.errors import UserError
 
 
-class OnPolicy:
+class OnPolicy(GradientAlgorithm):
     """An on-policy actor-critic algorithm, put together from TorchRL parts (``conf/algo/ppo.yaml``).
 
     It is a :class:`physai.algorithms.Algorithm`. The factories are what ``_partial_: true`` makes of a config node.
@@ -64,10 +64,10 @@ class OnPolicy:
             )
         if "state_value" not in networks.critic.out_keys:
             raise UserError("policy.critic.in_keys: this algorithm's critic judges states: it must not see 'action'")
-        self.loss = loss(actor_network=networks.actor, critic_network=networks.critic)
+        made = loss(actor_network=networks.actor, critic_network=networks.critic)
         self.advantage = advantage(value_network=networks.critic)
         check_ranges("algo.advantage", self.advantage)
-        self.optimizer = LossOptimizer(self.loss, optimizer, scheduler, max_grad_norm)
+        super().__init__(made, optimizer, scheduler, max_grad_norm)
         self.buffer = buffer
         self.minibatch_size = minibatch_size
         self._device = networks.device
@@ -96,12 +96,12 @@ class OnPolicy:
         for _ in range(self.epochs):
             for minibatch in self._sequences(frames) if self._in_sequences else self._minibatches():
                 losses = self.loss(minibatch)
-                results.append(losses.set("grad_norm", self.optimizer.step(losses, minibatch)))
+                results.append(losses.set("grad_norm", self.step(losses, minibatch)))
         with torch.no_grad():
             means: TensorDictBase = torch.stack(results).mean(dim=0)
             metrics = {key: float(value) for key, value in means.items()}
             metrics["explained_variance"] = _explained_variance(*(batch.get(key) for key in self._judged))
-        return metrics | {"lr": self.optimizer.end_batch()}
+        return metrics | {"lr": self.end_batch()}
 
     def _sequences(self, frames: TensorDictBase) -> Iterator[TensorDictBase]:
         """Whole rows of frames [N, T], in another order for each epoch."""
@@ -113,18 +113,6 @@ class OnPolicy:
         # One draw an epoch, and slices of it: drawing each minibatch from the buffer takes eight times as long.
         parts = self.buffer.sample().split(self.minibatch_size)
         return (part for part in parts if len(part) == self.minibatch_size)
-
-    def weights(self) -> dict[str, Tensor]:
-        """All weights by name."""
-        return self.optimizer.weights()
-
-    def state(self) -> dict[str, Any]:
-        """Return what ``set_state`` needs to go on bit for bit."""
-        return self.optimizer.state()
-
-    def set_state(self, state: dict[str, Any]) -> None:
-        """Restore what ``state`` returned."""
-        self.optimizer.set_state(state)
 
 
 def _explained_variance(value: Tensor, target: Tensor) -> float:

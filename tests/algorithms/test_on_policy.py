@@ -221,5 +221,5 @@ def test_any_torchrl_part_can_be_swapped_from_the_command_line():
     ]
     algorithm = build(actor, critic, 32, *overrides)
     assert isinstance(algorithm, OnPolicy)
-    assert type(algorithm.optimizer.optimizer) is torch.optim.AdamW
+    assert type(algorithm.optimizer) is torch.optim.AdamW
     assert math.isfinite(algorithm.update(batch)["loss_objective"])

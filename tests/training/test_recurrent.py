@@ -35,7 +35,7 @@ def test_collected_sequences_have_the_probabilities_that_learning_starts_from():
 
 def test_it_learns_from_whole_sequences_each_once_an_epoch(monkeypatch):
     agent = Agent.build(small_config("policy=gru", "algo.epochs=2", "algo.minibatch_size=300"))
-    seen, loss = [], agent.algorithm.optimizer.loss
+    seen, loss = [], agent.algorithm.loss
     forward = loss.forward
     monkeypatch.setattr(
         loss, "forward", lambda minibatch: seen.append(minibatch["latent_action"]) or forward(minibatch)

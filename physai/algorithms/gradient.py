@@ -1,4 +1,4 @@
-"""Gradient steps on a TorchRL loss: what all algorithms share."""
+"""What all algorithms share: gradient steps on a TorchRL loss."""
 
 from collections.abc import Callable
 from typing import Any
@@ -35,7 +35,7 @@ def check_ranges(where: str, module: nn.Module) -> None:
             raise UserError(f"{where}.{name}: must be between {low:g} and {high:g}, got {float(value):g}")
 
 
-class LossOptimizer:
+class GradientAlgorithm:
     """Follows the gradient of the sum of a loss module's ``loss_*`` outputs.
 
     Args:
