@@ -10,7 +10,8 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from typing import Any
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)
 """What ends a program, and reaches all processes of a terminal or a container."""
@@ -63,6 +64,25 @@ def end_with(starter: int) -> None:
 
 
 @contextlib.contextmanager
+def handling(numbers: Iterable[int], handler: Callable[[int, Any], object] | None = None) -> Iterator[None]:
+    """Context after which signals have the handlers again that they had before.
+
+    Args:
+        numbers: The signals.
+        handler: What handles them meanwhile; None leaves that as it is.
+    """
+    before = {number: signal.getsignal(number) for number in numbers}
+    try:
+        if handler is not None:
+            for number in before:
+                signal.signal(number, handler)
+        yield
+    finally:
+        for number, former in before.items():
+            signal.signal(number, former)
+
+
+@contextlib.contextmanager
 def signals_wait() -> Iterator[None]:
     """Context to fork in: signals that arrive in it are handled at its end.
 
@@ -72,12 +92,10 @@ def signals_wait() -> Iterator[None]:
         yield
         return
     arrived: list[int] = []
-    before = {number: signal.signal(number, lambda number, _: arrived.append(number)) for number in SIGNALS}
     try:
-        yield
+        with handling(SIGNALS, lambda number, _: arrived.append(number)):
+            yield
     finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
         for arrival in arrived:
             signal.raise_signal(arrival)
 

@@ -4,7 +4,6 @@ import contextlib
 import ctypes
 import gc
 import importlib.util
-import itertools
 import os
 import shutil
 import signal
@@ -17,6 +16,7 @@ from pathlib import Path
 
 import hydra
 from hydra._internal.callbacks import Callbacks
+from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.utils import run_job
 from hydra.types import HydraContext, RunMode
@@ -25,7 +25,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from physai.compose import compose, conf_dir, initialized, jobs_at_once, parse, set_plugin_defaults
 from physai.errors import UserError
-from physai.processes import end_with
+from physai.processes import end_with, handling
 
 _SIGNALS = (signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)
 
@@ -84,35 +84,30 @@ def overrides() -> list[str]:
     return [argument for argument in sys.argv[1:] if not argument.startswith("-")]
 
 
-class guard:  # noqa: N801
+@contextlib.contextmanager
+def guard() -> Iterator[None]:
     """Context in which what a user or a disk does wrong ends in one line and exit code 2, and Ctrl-C in 130.
 
     With ``HYDRA_FULL_ERROR=1`` the traceback comes before the line. Other signals end it like Ctrl-C, so that a robot
     is not left moving.
     """
-
-    def __enter__(self) -> None:
-        # One that is ignored already stays so: that is what nohup asks for.
-        heard = [number for number in _SIGNALS if signal.getsignal(number) is not signal.SIG_IGN]
-        self._before = {number: signal.signal(number, lambda number, _: sys.exit(128 + number)) for number in heard}
-
-    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
-        for number, handler in self._before.items():
-            signal.signal(number, handler)
-        if isinstance(error, UserError | OSError | ImportError) and os.environ.get("HYDRA_FULL_ERROR") == "1":
+    # One that is ignored already stays so: that is what nohup asks for.
+    heard = [number for number in _SIGNALS if signal.getsignal(number) is not signal.SIG_IGN]
+    try:
+        with handling(heard, lambda number, _: sys.exit(128 + number)):
+            yield
+    except KeyboardInterrupt:
+        sys.exit(130)
+    except (UserError, OSError, ImportError) as error:
+        if os.environ.get("HYDRA_FULL_ERROR") == "1":
             traceback.print_exception(error)
-        if isinstance(error, UserError):
-            print(f"error: {printable(str(error))}", file=sys.stderr)
-            sys.exit(2)
-        if isinstance(error, ImportError):  # of what is half installed; TorchRL imports a simulator where it finds one
-            print(f"error: {printable(' '.join(str(error).split()))}", file=sys.stderr)
-            sys.exit(2)
+        line = str(error)
         if isinstance(error, OSError):
-            where = str(error.filename or "the disk")
-            print(f"error: {printable(f'{where}: {error.strerror or error}')}", file=sys.stderr)
-            sys.exit(2)
-        if isinstance(error, KeyboardInterrupt):
-            sys.exit(130)
+            line = f"{error.filename or 'the disk'}: {error.strerror or error}"
+        elif isinstance(error, ImportError):  # of what is half installed: TorchRL imports each simulator that it finds
+            line = " ".join(line.split())
+        print(f"error: {printable(line)}", file=sys.stderr)
+        sys.exit(2)
 
 
 def printable(text: str) -> str:
@@ -188,18 +183,13 @@ def _check_all(
     return whole, pinned
 
 
-def _combinations(given: list[str]) -> Iterable[list[str]]:
+def _combinations(given: list[str]) -> list[list[str]]:
     """Every job of a sweep."""
-    choices = []
-    for override in parse(given):
-        if not override.is_sweep_override():
-            choices.append([str(override.input_line)])
-        elif override.is_discrete_sweep():
-            key = override.get_key_element()
-            choices.append([f"{key}={value}" for value in override.sweep_string_iterator()])
-        else:
+    parsed = parse(given)
+    for override in parsed:
+        if override.is_sweep_override() and not override.is_discrete_sweep():
             raise UserError(f"'{override.input_line}': python -m physai.search looks through an interval; -m does not")
-    return (list(one) for one in itertools.product(*choices))
+    return BasicSweeper.split_arguments(parsed, None)[0]
 
 
 def _begin(config: DictConfig) -> Path:

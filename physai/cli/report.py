@@ -13,6 +13,7 @@ from rich.console import Console
 from rich.table import Table
 
 from physai.errors import UserError
+from physai.processes import handling
 
 
 class SweepReport(Callback):
@@ -28,12 +29,8 @@ class SweepReport(Callback):
         arguments = OmegaConf.to_container(config.hydra.launcher.ray.init, resolve=True)
         if arguments.get("address") == "local":
             arguments.setdefault("object_store_memory", 80 * 2**20)  # jobs hand nothing over
-        handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-        try:
+        with handling((signal.SIGINT, signal.SIGTERM)):
             ray.init(**arguments)
-        finally:
-            for number, handler in handlers.items():
-                signal.signal(number, handler)
 
     def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:
         """Report on the runs below the sweep's folder."""
