@@ -3,6 +3,7 @@
 import os
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
+from copy import deepcopy
 from functools import partial
 from multiprocessing import connection
 from multiprocessing.process import BaseProcess
@@ -15,7 +16,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import multiprocessing
 from torchrl.collectors import MultiCollector, _runner
 
-from physai.collectors.worker import MakeEnv, NormalizedPolicy, WorkerCollector
+from physai.collectors.worker import MakeEnv, WorkerCollector, acting, each
 from physai.envs.make import TransformedRobotEnv
 from physai.errors import UserError
 from physai.processes import follow, signals_wait
@@ -44,12 +45,10 @@ class RobotMultiCollector(MultiCollector):
         normalizer: Normalizer,
         **torchrl: Any,
     ) -> None:
-        self._policy_of_learner = NormalizedPolicy(policy, normalizer)
-        self._copies = [self._policy_of_learner.copy().share_memory() for _ in range(workers)]
+        learner = acting(policy, normalizer)
+        self._copies: list[Any] = [deepcopy(learner).cpu().share_memory() for _ in range(workers)]
         # The tensors themselves: load_state_dict would take half a millisecond of every batch.
-        self._weights, *self._weights_of = (
-            list(one.state_dict().values()) for one in (self._policy_of_learner, *self._copies)
-        )
+        self._weights, *self._weights_of = (list(one.state_dict().values()) for one in (learner, *self._copies))
         threads, method = torch.get_num_threads(), multiprocessing.get_start_method(allow_none=True)
         before = set(multiprocessing.active_children())
         # Forked workers start at once; fresh ones would import for seconds.
@@ -58,10 +57,10 @@ class RobotMultiCollector(MultiCollector):
             with signals_wait(), self._one_line():
                 super().__init__(
                     [
-                        partial(_start_worker, os.getpid(), make_env, copy.normalizer, worker)
+                        partial(_start_worker, os.getpid(), make_env, copy["normalizer"], worker)
                         for worker, copy in enumerate(self._copies)
                     ],
-                    policy_factory=[partial(_same, copy.policy) for copy in self._copies],
+                    policy_factory=[partial(_same, copy["policy"]) for copy in self._copies],
                     collector_class=WorkerCollector,
                     use_buffers=True,
                     auto_register_policy_transforms=False,
@@ -77,8 +76,8 @@ class RobotMultiCollector(MultiCollector):
 
     def _renew(self, worker: int) -> None:
         """Let a worker that stands still act as the learner would now."""
-        for acting, learning in zip(self._weights_of[worker], self._weights, strict=True):
-            acting.copy_(learning)
+        for copy, weights in zip(self._weights_of[worker], self._weights, strict=True):
+            copy.copy_(weights)
 
     def iterator(self) -> Iterator[TensorDictBase]:
         """Collect batches.
@@ -86,13 +85,7 @@ class RobotMultiCollector(MultiCollector):
         Raises:
             UserError: If a worker has died.
         """
-        batches = super().iterator()
-        while True:
-            with self._one_line():
-                batch = next(batches, None)
-            if batch is None:
-                return
-            yield batch
+        return each(super().iterator(), self._one_line)
 
     @contextmanager
     def _one_line(self) -> Iterator[None]:

@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 from collections.abc import Iterator
+from copy import deepcopy
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -20,10 +21,10 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torchrl.collectors.distributed import RayCollector
 
-from physai.collectors.worker import MakeEnv, NormalizedPolicy, WorkerCollector
+from physai.collectors.worker import MakeEnv, WorkerCollector, acting, each
 from physai.config import nearest
 from physai.errors import UserError
-from physai.processes import SIGNALS, kill_with_this
+from physai.processes import SIGNALS, handling, kill_with_this
 from physai.transforms.normalization import Normalizer
 
 _START_SECONDS = 60  # for a cluster that may be busy
@@ -33,7 +34,7 @@ class RobotRayCollector(RayCollector):
     """TorchRL's collector on Ray: several processes, each of which brings its share of every batch.
 
     Batches are [N, T], the robots of one process after those of the other. What they act with is sent to them before
-    each batch. With the same seed the frames are those of :class:`physai.collectors.RobotMultiSyncCollector`, and they
+    each batch. With the same seed the frames are those of :mod:`physai.collectors.multi_sync`, and they
     continue from ``state`` bit for bit, on machines of one kind.
 
     Args:
@@ -57,7 +58,7 @@ class RobotRayCollector(RayCollector):
         ray_init: dict[str, Any],
         **torchrl: Any,
     ) -> None:
-        self._policy_of_learner = NormalizedPolicy(policy, normalizer)
+        self._learner = acting(policy, normalizer)
         self._ended = False
         self._watcher: subprocess.Popen[bytes] | None = None
         others = _descendants(os.getpid())
@@ -66,7 +67,7 @@ class RobotRayCollector(RayCollector):
             with _one_line():
                 super().__init__(
                     [partial(make_env, worker) for worker in range(workers)],
-                    self._policy_of_learner.copy().policy,
+                    deepcopy(policy).cpu(),
                     sync=True,
                     collector_class=WorkerCollector,
                     collector_kwargs=[{"auto_register_policy_transforms": False} for _ in range(workers)],
@@ -93,7 +94,7 @@ class RobotRayCollector(RayCollector):
 
     def update_policy_weights_(self, *_: Any, **__: Any) -> None:
         """Send the workers what to act with; TorchRL calls it before each batch."""
-        weights = ray.put({name: value.cpu() for name, value in self._policy_of_learner.state_dict().items()})
+        weights = ray.put({name: value.cpu() for name, value in self._learner.state_dict().items()})
         for collector in self.remote_collectors:
             collector.renew.remote(weights)
 
@@ -103,13 +104,7 @@ class RobotRayCollector(RayCollector):
         Raises:
             UserError: If a worker has died.
         """
-        batches = super().iterator()
-        while True:
-            with _one_line():
-                batch = next(batches, None)
-            if batch is None:
-                return
-            yield batch.flatten(0, 1)  # from [processes, robots, steps]
+        return (batch.flatten(0, 1) for batch in each(super().iterator(), _one_line))  # from [processes, robots, steps]
 
     def state(self) -> dict[str, Any]:
         """Return the state of all workers."""
@@ -143,16 +138,15 @@ def _start_ray(arguments: dict[str, Any], workers: int) -> None:
         arguments = {"num_cpus": workers} | arguments
     # Signals to a terminal or a container reach Ray's processes, too, which inherit that they wait: the learner says
     # what comes of them. It keeps its own handler: Ray sets one.
-    handler = signal.getsignal(signal.SIGTERM)
     before = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
     try:
-        ray.init(**arguments)
+        with handling([signal.SIGTERM]):
+            ray.init(**arguments)
     except Exception as error:  # Ray asserts, too
         wants_token = "InvalidAuthToken" in str(error.__cause__)
         hint = " (it wants a token: set RAY_AUTH_MODE=token)" if wants_token else ""
         raise UserError(f"collector.ray_init: {' '.join(str(error).split())}{hint}") from error
     finally:
-        signal.signal(signal.SIGTERM, handler)
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 

@@ -1,7 +1,7 @@
 """What collects in a process of its own, and what acts there."""
 
-from collections.abc import Callable
-from copy import deepcopy
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
 from typing import Any
 
 import torch
@@ -17,20 +17,24 @@ MakeEnv = Callable[[int], TransformedRobotEnv]
 """Builds the env of a worker from its number, in the worker's process."""
 
 
-class NormalizedPolicy(nn.Module):
-    """What decides how robots act: a policy, and the normalizer of what it sees.
+def acting(policy: TensorDictModuleBase, normalizer: Normalizer) -> nn.ModuleDict:
+    """Return what decides how robots act: a policy, and the normalizer of what it sees.
 
     Each worker has a copy, which follows the learner's between two batches and never in the middle of one.
     """
+    return nn.ModuleDict({"policy": policy, "normalizer": normalizer})
 
-    def __init__(self, policy: TensorDictModuleBase, normalizer: Normalizer) -> None:
-        super().__init__()
-        self.policy = policy
-        self.normalizer = normalizer
 
-    def copy(self) -> "NormalizedPolicy":
-        """Return a copy on the CPU, where robots are."""
-        return deepcopy(self).to("cpu")
+def each(
+    batches: Iterator[TensorDictBase], errors: Callable[[], AbstractContextManager[None]]
+) -> Iterator[TensorDictBase]:
+    """Collect batches in a context that says what errors mean; whoever takes them is outside of it."""
+    while True:
+        with errors():
+            batch = next(batches, None)
+        if batch is None:
+            return
+        yield batch
 
 
 class WorkerCollector(RobotCollector):
@@ -43,8 +47,8 @@ class WorkerCollector(RobotCollector):
         return batch.set(("collector", "traj_ids"), torch.zeros(batch.shape, dtype=torch.int64))
 
     def renew(self, weights: dict[str, Tensor]) -> None:
-        """Act from now on as an :class:`NormalizedPolicy` does whose ``state_dict`` this is."""
-        NormalizedPolicy(self.policy, self.env.normalizer).load_state_dict(weights)
+        """Act from now on as those do whose ``state_dict`` (:func:`acting`) this is."""
+        acting(self.policy, self.env.normalizer).load_state_dict(weights)
 
     def state_dict(self) -> dict[str, Any]:
         """Return the state of the env and of this process' random numbers."""
