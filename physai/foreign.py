@@ -4,13 +4,15 @@ What it names is held against the lists below before anything is imported. What 
 the command line, is the user's own, and passes where the run folder has the same at the same key.
 """
 
+import contextlib
 import functools
 import inspect
+import operator
 import os
 import re
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import yaml
 from omegaconf import OmegaConf
@@ -83,12 +85,7 @@ _DEEPEST = 40
 _MOST_VALUES = 20_000
 
 _Key = tuple[str | int, ...]
-
-
-class _Fault(NamedTuple):
-    key: _Key
-    value: Any
-    reason: str
+_Fault = tuple[_Key, str]  # where it is, and what is wrong there
 
 
 def read_config(
@@ -167,15 +164,15 @@ def checked(
         resume: See ``read_config``.
     """
     own = tuple(given)
-    _refuse((fault for fault in _interpolations(node) if not _is_own(fault, own, resolved=False)), path)
+    _refuse(_interpolations(node), node, path, own, resolved=False)
     try:
         config = OmegaConf.create(node)
         _count(config)
         plain = OmegaConf.to_container(config, resolve=True)
     except Exception as error:  # whatever OmegaConf makes of it
         raise UserError(f"{path}: the run's config is damaged ({' '.join(str(error).split())[:80]})") from error
-    _refuse((fault for fault in _faults(plain, allow, resume) if not _is_own(fault, own, resolved=True)), path)
-    _refuse((fault for fault in _impostors(plain, allow) if not _is_own(fault, own, resolved=True)), path)
+    _refuse(_faults(plain, allow, resume), plain, path, own, resolved=True)
+    _refuse(_impostors(plain, allow), plain, path, own, resolved=True)
     return plain
 
 
@@ -236,44 +233,38 @@ def _own(given: tuple[str, ...], resolved: bool) -> Any:
     return OmegaConf.to_container(compose("train", given), resolve=resolved)
 
 
-def _is_own(fault: _Fault, given: tuple[str, ...], resolved: bool) -> bool:
-    """Whether the user has chosen the same value for the same key."""
-    try:
-        own = _at(_own(given, resolved), fault.key)
-    except (KeyError, IndexError, TypeError):
-        return False
-    return type(own) is type(fault.value) and bool(own == fault.value)
+def _refuse(faults: Iterator[_Fault], node: Any, path: Path, given: tuple[str, ...], resolved: bool) -> None:
+    """Raise the first fault, unless the user has chosen the same value for the same key."""
+    for key, reason in faults:
+        with contextlib.suppress(KeyError, IndexError, TypeError):  # of a key that the user has not
+            theirs, own = _at(node, key), _at(_own(given, resolved), key)
+            if type(own) is type(theirs) and own == theirs:
+                continue
+        raise UserError(f"{path}: {'.'.join(map(str, key))}: {reason}")
 
 
 def _at(node: Any, key: _Key) -> Any:
-    for part in key:
-        node = node[part]
-    return node
+    return functools.reduce(operator.getitem, key, node)
 
 
-def _refuse(faults: Iterator[_Fault], path: Path) -> None:
-    for fault in faults:
-        raise UserError(f"{path}: {'.'.join(map(str, fault.key))}: {fault.reason}")
-
-
-def _walk(node: Any, key: _Key = ()) -> Iterator[tuple[_Key, Any]]:
+def walk(node: Any, key: _Key = ()) -> Iterator[tuple[_Key, Any]]:
     """Every value, containers too, with its keys."""
     yield key, node
     items = node.items() if isinstance(node, dict) else enumerate(node) if isinstance(node, list) else ()
     for part, value in items:
-        yield from _walk(value, (*key, part))
+        yield from walk(value, (*key, part))
 
 
 def _interpolations(node: Any) -> Iterator[_Fault]:
     """What would be resolved to more than another value of the config, or a number made of some."""
-    for key, value in _walk(node):
+    for key, value in walk(node):
         if isinstance(value, str) and value.count("${") != len(_INTERPOLATION.findall(value)):
-            yield _Fault(key, value, f"{shown(value)} asks for more than other values of the config")
+            yield key, f"{shown(value)} asks for more than other values of the config"
 
 
 def _names(node: Any) -> Iterator[tuple[_Key, Any]]:
     """Names of what will be made: those of activations are imported, too (``physai.policies``)."""
-    for key, value in _walk(node):
+    for key, value in walk(node):
         if key[-1:] == ("_target_",):
             yield key, value
         elif key[-1:] == ("activation",) and isinstance(value, str):
@@ -284,8 +275,8 @@ def _faults(node: Any, allow: Sequence[str], resume: bool) -> Iterator[_Fault]:
     """What can be seen without importing anything."""
     for key, name in _names(node):
         if not _may_be_named(name, allow):
-            yield _Fault(key, _at(node, key), _not_allowed(name))
-    for key, value in _walk(node):
+            yield key, _not_allowed(name)
+    for key, value in walk(node):
         last = key[-1] if key else ""
         reason = ""
         if not isinstance(last, str | int) or isinstance(last, bool) or not isinstance(value, _PLAIN):
@@ -300,7 +291,7 @@ def _faults(node: Any, allow: Sequence[str], resume: bool) -> Iterator[_Fault]:
                 beside = f"resume=... {group}{'.'.join(map(str, key))}=..."
                 reason = f"{shown(value)} is outside of the run folder; if you want it, say so: {beside}"
         if reason:
-            yield _Fault(key, value, reason)
+            yield key, reason
 
 
 _PLAIN = (type(None), bool, int, float, str, list, dict)
@@ -347,7 +338,7 @@ def _impostors(node: Any, allow: Sequence[str]) -> Iterator[_Fault]:
         except ValueError as error:
             reason = str(error)
         if reason:
-            yield _Fault(key, _at(node, key), reason)
+            yield key, reason
 
 
 def _is_part(found: Callable[..., Any], allow: Sequence[str]) -> bool:
@@ -359,10 +350,8 @@ def _is_part(found: Callable[..., Any], allow: Sequence[str]) -> bool:
     ancestors = [_home(base) for base in found.__mro__]
     if any(_is_in(ancestor, _NO_PARTS) for ancestor in ancestors):
         return False
-    for package, bases in _PARTS.items():
-        if _is_in(home, (package,)) and (not bases or not set(bases).isdisjoint(ancestors)):
-            return True
-    return False
+    families = [bases for package, bases in _PARTS.items() if _is_in(home, (package,))]
+    return any(not bases or not set(bases).isdisjoint(ancestors) for bases in families)
 
 
 def _home(found: Any) -> str:

@@ -3,9 +3,8 @@
 import contextlib
 import gc
 import sys
-from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from omegaconf import DictConfig, OmegaConf
 
@@ -73,12 +72,8 @@ class Training:
 
     def train(self, node: DictConfig, run_dir: Path) -> None:
         """Train, and export the best policy."""
-        from physai.training.run import run_training
-
-        config = _config(node)
         agent, self._agent = self._agent, None
-        with _ending(config, run_dir):
-            run_training(config, run_dir, agent=agent)
+        _train(_config(node), run_dir, agent=agent)
 
     def close(self) -> None:
         """Free what ``train`` did not take."""
@@ -91,7 +86,7 @@ class Training:
 def _resume(run_dir: Path, given: list[str]) -> None:
     from physai import foreign
     from physai.compose import compose
-    from physai.training.run import load_config, run_training
+    from physai.training.run import load_config
 
     if _sweeps():
         raise UserError("resume continues one run; it cannot be swept over")
@@ -103,11 +98,13 @@ def _resume(run_dir: Path, given: list[str]) -> None:
         node = compose("train", [*foreign.read_overrides(run_dir), *others])
         checked = foreign.checked(OmegaConf.to_container(node), path, allow, others, resume=True)
         wanted = _config(OmegaConf.create(checked | {"allow": allow}))
-        difference = _first_difference(config.model_dump(), wanted.model_dump())
-        if difference:
-            raise UserError(f"resume={run_dir}: the run has {difference}; a resumed run keeps its config")
-    with _ending(config, run_dir):
-        run_training(config, run_dir, resume=True)
+        run, asked = (dict(foreign.walk(one.model_dump())) for one in (config, wanted))
+        for key in {**run, **asked}:
+            old, new = run.get(key), asked.get(key)
+            if old != new and not (isinstance(old, dict) and isinstance(new, dict)):  # then a key in them differs, too
+                difference = f"{'.'.join(map(str, key))}={old}, not {new}"
+                raise UserError(f"resume={run_dir}: the run has {difference}; a resumed run keeps its config")
+    _train(config, run_dir, resume=True)
 
 
 def _allowed(override: str) -> list[str]:
@@ -121,30 +118,15 @@ def _allowed(override: str) -> list[str]:
     return validate(Allowed, OmegaConf.masked_copy(compose("train", [override]), ["allow"])).allow
 
 
-def _first_difference(run: Any, wanted: Any, key: str = "") -> str | None:
-    if isinstance(run, dict) and isinstance(wanted, dict):
-        for name in {**run, **wanted}:
-            found = _first_difference(run.get(name), wanted.get(name), f"{key}.{name}" if key else name)
-            if found:
-                return found
-        return None
-    return None if run == wanted else f"{key}={run}, not {wanted}"
-
-
-@contextlib.contextmanager
-def _ending(config: "TrainConfig", run_dir: Path) -> Iterator[None]:
-    """Context that trains; then the run is drawn and its policy exported, or the user told how to go on."""
-    from physai.training.stopping import Interrupted
+def _train(config: "TrainConfig", run_dir: Path, resume: bool = False, agent: "Agent | None" = None) -> None:
+    """Train, draw the run, and export its policy."""
+    from physai.training.run import run_training
 
     complete = (run_dir / "summary.json").is_file()
-    try:
-        yield
-        if not (complete and (run_dir / "training.png").is_file()):
-            _draw(run_dir)
-        _export(config, run_dir, complete)
-    except Interrupted as stopped:
-        print(f"\nStopped by {stopped}; everything is saved. Go on with:\n  python -m physai.train resume={run_dir}")
-        sys.exit(stopped.exit_code)
+    run_training(config, run_dir, resume, agent)
+    if not (complete and (run_dir / "training.png").is_file()):
+        _draw(run_dir)
+    _export(config, run_dir, complete)
 
 
 def _draw(run_dir: Path) -> None:

@@ -33,7 +33,7 @@ from physai.training.evaluation import (
     evaluate_in_a_row,
     wilson,
 )
-from physai.training.stopping import Interrupted, stop_signals
+from physai.training.stopping import end_stopped, stop_signals
 from physai.training.trainer import Trainer
 
 FINAL_SEED = derive(0, "final evaluation goals")
@@ -89,7 +89,7 @@ def run_training(
         trainer = make_trainer(config, run_dir, agent, evaluation, resume)
         trainer.fit(stop)
         if stop:
-            raise Interrupted(stop[0])
+            end_stopped(stop[0], run_dir)
         print(f"Evaluating the best policy on {config.evaluation.episodes:,} goals it has never seen ...", flush=True)
         best = TrainedPolicy(run_dir, "best", config=config)
         result = best.evaluate(config.evaluation.episodes)
@@ -97,7 +97,7 @@ def run_training(
         summary = _summary(config, trainer, evaluation.best_frames, figures)
         write_atomically(done, json.dumps(summary, indent=2).encode())
     if stop:  # too late to matter for this run, but a sweep must end
-        raise Interrupted(stop[0])
+        end_stopped(stop[0], run_dir)
     print_summary(summary, f"{config.env.name}: the best policy, on {len(result.success):,} goals it has never seen")
     print(f"Run folder: {run_dir}")
     return summary

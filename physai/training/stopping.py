@@ -3,16 +3,20 @@
 import contextlib
 import os
 import signal
+import sys
 from collections.abc import Iterator
+from pathlib import Path
 from types import FrameType
+from typing import NoReturn
+
+from physai.processes import handling
 
 
-class Interrupted(Exception):  # noqa: N818
-    """A signal asked the run to stop; everything is saved."""
-
-    def __init__(self, signal_number: int) -> None:
-        super().__init__(signal.Signals(signal_number).name)
-        self.exit_code = 128 + signal_number
+def end_stopped(number: int, run_dir: Path) -> NoReturn:
+    """End as a signal has asked for, once everything is saved."""
+    name = signal.Signals(number).name
+    print(f"\nStopped by {name}; everything is saved. Go on with:\n  python -m physai.train resume={run_dir}")
+    sys.exit(128 + number)
 
 
 @contextlib.contextmanager
@@ -25,9 +29,5 @@ def stop_signals() -> Iterator[list[int]]:
             os._exit(128 + number)
         received.append(number)
 
-    before = {number: signal.signal(number, remember) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
+    with handling((signal.SIGINT, signal.SIGTERM), remember):
         yield received
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
