@@ -87,8 +87,7 @@ def keys(node: DictConfig, prefix: str = "") -> list[str]:
     found = []
     for key in node:
         found.append(f"{prefix}{key}")
-        if not OmegaConf.is_missing(node, key) and isinstance(node._get_node(key), DictConfig):
-            child = node._get_node(key)
-            if child is not None and not child._is_none():
-                found += keys(child, f"{prefix}{key}.")
+        child = None if OmegaConf.is_missing(node, key) else node._get_node(key)
+        if isinstance(child, DictConfig) and not child._is_none():
+            found += keys(child, f"{prefix}{key}.")
     return found

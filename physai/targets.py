@@ -4,7 +4,7 @@ import importlib
 import inspect
 import types
 import typing
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Annotated, Any
 
 from hydra.errors import InstantiationException
@@ -42,7 +42,7 @@ def find(name: str) -> Any:
     while module:
         try:
             found = importlib.import_module(module)
-        except UserError:
+        except (UserError, KeyboardInterrupt):
             raise
         except ModuleNotFoundError as error:
             if not f"{module}.".startswith(f"{error.name}."):  # it is there, and needs what is not
@@ -50,8 +50,6 @@ def find(name: str) -> Any:
             outer, _, inner = module.rpartition(".")
             module, attribute = outer, f"{inner}.{attribute}"
             continue
-        except KeyboardInterrupt:
-            raise
         except BaseException as error:  # whatever a module does while it is imported, sys.exit() too
             reason = " ".join(str(error).split())[:_SHOWN]
             raise ValueError(f"{module} cannot be imported: {type(error).__name__}: {reason}") from error
@@ -87,9 +85,8 @@ def make(where: str, node: dict[str, Any], *arguments: Any, needs: Sequence[str]
         UserError: If it cannot be made, or is something else than what is wanted there.
     """
     try:
-        made = instantiate(node, _partial_=True, _convert_="all")(
-            *arguments, **parts
-        )  # Hydra makes dicts of dataclasses
+        maker = instantiate(node, _partial_=True, _convert_="all")  # with parts among its arguments, Hydra makes dicts
+        made = maker(*arguments, **parts)
     except Exception as error:  # whatever a part says to its arguments
         cause = (error.__cause__ or error) if isinstance(error, InstantiationException) else error
         if isinstance(cause, UserError):
@@ -129,11 +126,11 @@ def _check_target(node: dict[str, Any], path: str = "") -> dict[str, Any]:
             raise ValueError(
                 f": unknown key '{path.lstrip('.')}{'.' if path else ''}{key}' of {name}{nearest(str(key), hints)}"
             )
-        if isinstance(value, Mapping) and "_target_" in value:
-            node[key] = _check_target(dict(value), f"{path}.{key}")
-        elif isinstance(value, list) and any(isinstance(one, Mapping) and "_target_" in one for one in value):
+        if isinstance(value, dict) and "_target_" in value:
+            node[key] = _check_target(value, f"{path}.{key}")
+        elif isinstance(value, list) and any(isinstance(one, dict) and "_target_" in one for one in value):
             node[key] = [
-                _check_target(dict(one), f"{path}.{key}.{index}") if isinstance(one, Mapping) else one
+                _check_target(one, f"{path}.{key}.{index}") if isinstance(one, dict) else one
                 for index, one in enumerate(value)
             ]
         else:
@@ -159,10 +156,7 @@ def _parameters(target: Any) -> tuple[dict[str, Any], bool]:
         except Exception:  # names that are only there for type checkers
             types = {}
         for parameter in parameters:
-            if parameter.name != "self" and parameter.kind not in (
-                parameter.VAR_KEYWORD,
-                parameter.VAR_POSITIONAL,
-            ):
+            if parameter.name != "self" and parameter.kind not in (parameter.VAR_KEYWORD, parameter.VAR_POSITIONAL):
                 hints.setdefault(parameter.name, types.get(parameter.name, Any))
         if not any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters):
             return hints, False

@@ -142,7 +142,7 @@ class OffPolicy(GradientAlgorithm):
     def state(self) -> dict[str, Any]:
         """Return what ``set_state`` needs to go on bit for bit: all frames in the buffer, too."""
         held = len(self.buffer)
-        frames = self.buffer.storage.get(range(held)) if held else {}
+        frames: Any = self.buffer.storage.get(range(held)) if held else None
         return {
             **super().state(),
             "frames": {".".join(key): frames.get(key).clone() for key in self._keys} if held else {},

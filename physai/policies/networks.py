@@ -2,6 +2,7 @@
 
 import importlib
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -16,8 +17,10 @@ from physai.errors import UserError
 from physai.policies.distributions import HALF_LOG_TWO_PI, DiagonalNormal
 
 
-def input_size(observation_spec: Composite, in_keys: Sequence[str], where: str) -> int:
+def input_size(observation_spec: Composite, in_keys: Any, where: str) -> int:
     """Return how many numbers ``in_keys`` of an env bring, or raise a UserError that says where a key is wrong."""
+    if not isinstance(in_keys, list) or not all(isinstance(key, str) for key in in_keys):
+        raise UserError(f"{where}.in_keys: a list of keys of the env is needed")
     for key in in_keys:
         given = list(observation_spec.keys())
         if key not in given:

@@ -71,7 +71,7 @@ class Agent:
         env = make_robots(config.collector.envs_of_learner, derive(config.seed, "train"))
         actor = make_actor(config, env).to(device)
         judged = Composite(**env.observation_spec, **env.full_action_spec, shape=env.batch_size)
-        inputs = input_size(judged, _in_keys(config.policy.critic, "policy.critic"), "policy.critic")
+        inputs = input_size(judged, config.policy.critic.get("in_keys"), "policy.critic")
         critic = make("policy.critic", config.policy.critic, needs=_NETWORK, in_features=inputs).to(device)
         algorithm = make(
             "algo",
@@ -144,19 +144,12 @@ class Agent:
 
 def make_actor(config: TrainConfig, env: TransformedRobotEnv) -> TensorDictModuleBase:
     """Build an untrained actor for an env."""
-    inputs = input_size(env.observation_spec, _in_keys(config.policy.actor, "policy.actor"), "policy.actor")
+    inputs = input_size(env.observation_spec, config.policy.actor.get("in_keys"), "policy.actor")
     sizes = {"in_features": inputs, "action_size": env.action_spec.shape[-1]}
     actor = make("policy.actor", config.policy.actor, needs=(*_NETWORK, "deterministic"), **sizes)
     if getattr(actor, "memory_size", 0) != config.policy.memory_size:  # the env is made first, from the config
         raise UserError("policy.actor: how much an actor remembers is its argument memory_size")
     return actor
-
-
-def _in_keys(node: dict[str, Any], where: str) -> list[str]:
-    keys = node.get("in_keys")
-    if not isinstance(keys, list) or not all(isinstance(key, str) for key in keys):
-        raise UserError(f"{where}.in_keys: a list of keys of the env is needed")
-    return keys
 
 
 def load_policy_state(actor: TensorDictModuleBase, env: TransformedRobotEnv, state: dict[str, Any]) -> None:

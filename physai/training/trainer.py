@@ -135,7 +135,12 @@ class Trainer:
             if stop:
                 self.save()
         except NonFiniteError as error:
-            raise UserError(self._keep_evidence(error)) from error
+            evidence = self.run_dir / "not_finite.pt"
+            checkpoint.save(evidence, {"batch": error.batch.to_dict(), "frames": self.clock.frames})
+            raise UserError(
+                f"iteration {self.clock.iteration}: {error} is not finite; the batch is in {evidence}, "
+                f"the last good checkpoint is {self._last_good()}"
+            ) from error
         except OSError as error:
             raise UserError(
                 f"cannot write to {self.run_dir}: {error.strerror or error}; last good checkpoint: {self._last_good()}"
@@ -180,11 +185,3 @@ class Trainer:
 
     def _last_good(self) -> str:
         return str(self.folder.paths()[-1]) if self.folder.paths() else "none yet"
-
-    def _keep_evidence(self, error: NonFiniteError) -> str:
-        evidence = self.run_dir / "not_finite.pt"
-        checkpoint.save(evidence, {"batch": error.batch.to_dict(), "frames": self.clock.frames})
-        return (
-            f"iteration {self.clock.iteration}: {error} is not finite; the batch is in {evidence}, "
-            f"the last good checkpoint is {self._last_good()}"
-        )
