@@ -175,8 +175,7 @@ def test_a_run_of_ones_own_parts_is_judged_and_exported_where_it_was_trained(own
 
     monkeypatch.setattr(artifact, "export_policy", export)
     config = validate(TrainConfig, compose("train", [*TINY, EXPORTED, "env.task._target_=mypackage.Mine"]))
-    with train._ending(config, own):
-        run_training(config, own, resume=True)
+    train._train(config, own, resume=True)
     assert (own / "summary.json").is_file()
     assert exported == [config]
 

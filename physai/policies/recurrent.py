@@ -1,10 +1,12 @@
 """A policy that remembers: a gated recurrent unit beside the perceptron."""
 
+from typing import Any
+
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 
-from physai.config import Count, PositiveFloat
+from physai.config import Count
 from physai.policies.networks import GaussianActor, side_by_side
 
 
@@ -21,12 +23,9 @@ class GRUActor(GaussianActor):
 
     Args:
         in_features: Numbers that ``in_keys`` bring.
-        action_size: n.
-        in_keys: Keys that the actor sees.
-        hidden_sizes: Widths of the hidden layers.
-        activation: A ``torch.nn`` module's name.
-        initial_std: Standard deviation of the first policy.
+        *args: Those of :class:`GaussianActor`, from ``action_size`` on.
         memory_size: H.
+        **kwargs: The same by name.
 
     Attributes:
         seen_keys: ``in_keys`` as given; ``in_keys`` holds what else the actor reads, too.
@@ -34,22 +33,13 @@ class GRUActor(GaussianActor):
 
     out_keys = (*GaussianActor.out_keys, "new_memory")
 
-    def __init__(
-        self,
-        in_features: int,
-        action_size: int,
-        in_keys: list[str],
-        hidden_sizes: list[Count],
-        activation: str,
-        initial_std: PositiveFloat,
-        memory_size: Count,
-    ) -> None:
-        super().__init__(in_features + memory_size, action_size, in_keys, hidden_sizes, activation, initial_std)
+    def __init__(self, in_features: int, *args: Any, memory_size: Count, **kwargs: Any) -> None:
+        super().__init__(in_features + memory_size, *args, **kwargs)
         self.memory_size = memory_size
         self.cell = nn.GRUCell(in_features, memory_size)
         nn.init.orthogonal_(self.cell.weight_hh)
-        self.seen_keys = in_keys
-        self.in_keys = [*in_keys, "memory", "episode_length"]
+        self.seen_keys = self.in_keys
+        self.in_keys = [*self.seen_keys, "memory", "episode_length"]
 
     def deterministic(self) -> nn.Module:
         """What acts without exploration, scriptable.
