@@ -10,7 +10,10 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 
 from physai.deploy import Policy, State
 
-_TROUBLE = {
+_LEVELS = {
+    State.WAITING.value: DiagnosticStatus.OK,
+    State.ACTIVE.value: DiagnosticStatus.OK,
+    State.REACHED.value: DiagnosticStatus.OK,
     State.HOLD.value: DiagnosticStatus.WARN,
     State.FAULT.value: DiagnosticStatus.ERROR,
     State.ESTOP.value: DiagnosticStatus.ERROR,
@@ -49,7 +52,7 @@ def diagnose(name: str, stamp: Time, policy: Policy, values: dict[str, Any]) -> 
     """Make the message from ``values``: a controller's snapshot, and whatever else is to be told."""
     flat = {**values, **{f"count: {key}": count for key, count in sorted(values["counters"].items())}}
     status = DiagnosticStatus(
-        level=_TROUBLE.get(values["state"], DiagnosticStatus.OK),
+        level=_LEVELS[values["state"]],
         name=f"{name}: arm",
         message=summary(values["state"], values["reasons"]),
         hardware_id=policy.metadata.robot,
