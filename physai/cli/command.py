@@ -4,6 +4,7 @@ import contextlib
 import ctypes
 import gc
 import importlib.util
+import itertools
 import os
 import shutil
 import signal
@@ -16,7 +17,6 @@ from pathlib import Path
 
 import hydra
 from hydra._internal.callbacks import Callbacks
-from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.utils import run_job
 from hydra.types import HydraContext, RunMode
@@ -183,13 +183,18 @@ def _check_all(
     return whole, pinned
 
 
-def _combinations(given: list[str]) -> list[list[str]]:
+def _combinations(given: list[str]) -> Iterable[list[str]]:
     """Every job of a sweep."""
-    parsed = parse(given)
-    for override in parsed:
-        if override.is_sweep_override() and not override.is_discrete_sweep():
+    choices = []
+    for override in parse(given):
+        if not override.is_sweep_override():
+            choices.append([str(override.input_line)])
+        elif override.is_discrete_sweep():
+            key = override.get_key_element()
+            choices.append([f"{key}={value}" for value in override.sweep_string_iterator()])
+        else:
             raise UserError(f"'{override.input_line}': python -m physai.search looks through an interval; -m does not")
-    return BasicSweeper.split_arguments(parsed, None)[0]
+    return (list(one) for one in itertools.product(*choices))
 
 
 def _begin(config: DictConfig) -> Path:
