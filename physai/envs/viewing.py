@@ -7,10 +7,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
+from physai.config import not_installed
 from physai.envs.simulation import Simulation
+from physai.errors import UserError
 from physai.signals import Quantity
 
 if TYPE_CHECKING:
+    from physai.physics.stick_figure import StickFigure
     from physai.physics.viewer import Viewer
 
 _SIZE = 0.03  # m; of the marker of a goal whose tolerance is no length
@@ -21,28 +24,30 @@ def has_screen() -> bool:
     return not sys.platform.startswith("linux") or bool(os.environ.get("DISPLAY"))
 
 
-def make_viewer(simulation: Simulation, window: bool = False) -> "Viewer":
-    """Make a viewer for these robots; it has a world of its own.
+def make_viewer(simulation: Simulation, window: bool = False) -> "Viewer | StickFigure":
+    """Make a viewer for these robots; it has a world of its own. Without PyBullet it draws lines.
 
     Raises:
-        UserError: If a window is asked for where there is no screen, or if there is nothing that draws.
+        UserError: If a window is asked for where there is no screen, or no PyBullet to open it.
     """
-    from physai.errors import UserError
-
+    if window and not has_screen():
+        raise UserError("there is no screen here (DISPLAY is not set): render images instead of a window")
+    tolerance, reach = simulation.task.tolerances[0], simulation.kinematics.reach
+    size = tolerance.value if tolerance.unit == "m" else _SIZE
     try:
         from physai.physics.viewer import Viewer
     except ModuleNotFoundError as error:
-        raise UserError(f"pictures of robots need {error.name}, which has no wheels for Pythons after 3.11") from error
-    if window and not has_screen():
-        raise UserError("there is no screen here (DISPLAY is not set): render images instead of a window")
+        if window:
+            raise UserError(f"a window needs {not_installed('pybullet')}: render images instead") from error
+        from physai.physics.stick_figure import StickFigure
+
+        return StickFigure(simulation.spec, reach, size)
     home = torch.from_numpy(simulation.spec.home).float()
     height = float(simulation.kinematics(home[None])[0, 2])
-    tolerance = simulation.task.tolerances[0]
-    size = tolerance.value if tolerance.unit == "m" else _SIZE
-    return Viewer(simulation.spec, height, simulation.kinematics.reach, size, window)
+    return Viewer(simulation.spec, height, reach, size, window)
 
 
-def show(viewer: "Viewer", simulation: Simulation, row: int = 0) -> np.ndarray | None:
+def show(viewer: "Viewer | StickFigure", simulation: Simulation, row: int = 0) -> np.ndarray | None:
     """Show a robot and its goal; return an image [height, width, 3] uint8, or None with a window."""
     goal = simulation.goal[row]
     if simulation.task.goal.quantity is Quantity.JOINT_POSITION:  # where the end effector would be

@@ -136,7 +136,7 @@ def _check_pip(given: Sequence[str]) -> None:
 def _check_ros2(given: Sequence[str]) -> None:
     match list(given):
         case ["launch", "physai", file, *values]:
-            arguments = re.findall(r'DeclareLaunchArgument\(\s*"(\w+)"', (PACKAGE / "launch" / file).read_text())
+            arguments = re.findall(r'(?:Argument|switch)\(\s*"(\w+)"', (PACKAGE / "launch" / file).read_text())
             assert {value.partition(":=")[0] for value in values} <= set(arguments)
         case ["run", "physai", node, "--ros-args", *rest]:
             assert (PACKAGE / "lib" / node).is_file()

@@ -4,6 +4,7 @@ import sys
 
 import numpy as np
 import pytest
+import torch
 
 from physai.envs.simulation import Simulation
 from physai.envs.viewing import make_viewer, show
@@ -56,10 +57,20 @@ def test_a_goal_of_joints_is_shown_where_they_bring_the_end_effector(simulate):
     assert abs(centre(show(viewer, simulation))[1] - centre(show(viewer, simulation, row=1))[1]) > 20
 
 
-def test_without_pybullet_there_is_one_line_and_no_picture(simulate, monkeypatch):
+def test_without_pybullet_robots_are_drawn_as_lines(simulate, monkeypatch):
     """As on Python 3.12 and later, for which there are no wheels of it."""
     simulation, _ = simulate()
+    simulation.reset()
     monkeypatch.setitem(sys.modules, "pybullet", None)
     monkeypatch.delitem(sys.modules, "physai.physics.viewer")
-    with pytest.raises(UserError, match="pictures of robots need pybullet"):
-        make_viewer(simulation)
+    viewer = make_viewer(simulation)
+    first, second = show(viewer, simulation), show(viewer, simulation, row=1)
+    assert first.shape == second.shape == (360, 480, 3)
+    assert first.dtype == np.uint8
+    assert (first != second).any(axis=2).sum() > 500
+    position = simulation.state.joint_position
+    tip = simulation.kinematics(torch.from_numpy(position).float()).numpy()
+    np.testing.assert_allclose([viewer.points(pose)[-1] for pose in position], tip, atol=1e-5)
+    monkeypatch.setenv("DISPLAY", ":0")
+    with pytest.raises(UserError, match="a window needs 'pybullet', which is not installed"):
+        make_viewer(simulation, window=True)
