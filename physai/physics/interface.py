@@ -27,6 +27,19 @@ def nominal_dynamics(spec: RobotSpec) -> DynamicsParameters:
     }
 
 
+def loaded_links(spec: RobotSpec) -> tuple[str, ...]:
+    """Name what weighs something: the moving links, and the tip, though it may weigh nothing without its payload."""
+    return tuple(dict.fromkeys((*spec.moving_links, spec.end_effector)))
+
+
+def loaded_mass(spec: RobotSpec, parameters: DynamicsParameters) -> np.ndarray:
+    """Return the masses of :func:`loaded_links` with the payload, kg, [rows, links]."""
+    links, mass = loaded_links(spec), parameters["link_mass"]
+    mass = np.pad(mass, ((0, 0), (0, len(links) - mass.shape[1])))
+    mass[:, links.index(spec.end_effector)] += parameters["payload"][:, 0]
+    return mass
+
+
 @dataclass(frozen=True)
 class RobotState:
     """What N robots do; float64, robots are rows. None stands for what an engine or a robot does not tell.

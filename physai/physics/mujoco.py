@@ -8,8 +8,8 @@ import numpy as np
 from physai.config import Count, NonNegativeFloat, PositiveFloat
 from physai.errors import UserError
 from physai.physics.impulse import FASTEST, limit_velocity, motor_velocity
-from physai.physics.interface import DynamicsParameters, RobotState, nominal_dynamics
-from physai.robots import RobotSpec, urdf
+from physai.physics.interface import DynamicsParameters, RobotState, loaded_links, loaded_mass, nominal_dynamics
+from physai.robots import RobotSpec, engine_urdf
 from physai.signals import Quantity
 
 try:
@@ -73,9 +73,11 @@ class MuJoCoPhysics:
         model = _make_model(spec, motor, armature, control_dt / substeps)
         self._batch = Batch(model, num_robots, threads)
         self._position, self._velocity = self._batch.bind("qpos"), self._batch.bind("qvel")
-        self._links = [model.body(name).id for name in spec.moving_links]
-        self._unit_inertia = model.body_inertia[self._links] / model.body_mass[self._links, None]
-        self._tip = spec.moving_links.index(spec.end_effector)
+        names, mass = loaded_links(spec), model.body_mass
+        self._links = [model.body(name).id for name in names]
+        self._tip = model.body(spec.end_effector).id
+        self._moving = [model.body(name).id for name in spec.moving_links]
+        self._unit_inertia = model.body_inertia[self._links] / np.where(mass > 0, mass, 1.0)[self._links, None]
         self._mass, self._inertia = self._batch.expand("body_mass"), self._batch.expand("body_inertia")
         self._damping = self._batch.expand("dof_damping")
         self._motor: _Impulse | _Servo = (
@@ -94,8 +96,7 @@ class MuJoCoPhysics:
             return
         for key, value in parameters.items():
             self._parameters[key][rows] = value
-        mass = self._parameters["link_mass"][rows]
-        mass[:, self._tip] += self._parameters["payload"][rows, 0]
+        mass = loaded_mass(self._spec, {key: value[rows] for key, value in self._parameters.items()})
         self._mass[rows[:, None], self._links] = mass
         self._inertia[rows[:, None], self._links] = mass[:, :, None] * self._unit_inertia
         self._damping[rows] = self._parameters["joint_damping"][rows]
@@ -121,8 +122,9 @@ class MuJoCoPhysics:
         """Masses and damping as MuJoCo holds them; the rest as the motors got it."""
         parameters = {key: value.copy() for key, value in self._parameters.items()}
         parameters["joint_damping"] = self._damping.copy()
-        parameters["link_mass"] = self._mass[:, self._links]
-        parameters["link_mass"][:, self._tip] -= parameters["payload"][:, 0]
+        mass = self._mass.copy()
+        mass[:, self._tip] -= parameters["payload"][:, 0]
+        parameters["link_mass"] = mass[:, self._moving]
         return parameters
 
     def state(self) -> dict[str, np.ndarray]:
@@ -205,7 +207,7 @@ class _Servo:
 
 def _make_model(spec: RobotSpec, motor: str, armature: float, time_step: float) -> "mujoco.MjModel":
     try:
-        made = mujoco.MjSpec.from_string(urdf.without_shapes(spec.urdf, spec.joints).decode())
+        made = mujoco.MjSpec.from_string(engine_urdf(spec.bodies, spec.joints).decode())
         made.compiler.fusestatic = False  # a link keeps its mass to itself
         for joint in made.joints:
             joint.actfrclimited = False  # the effort limit is the motor's, each robot's own

@@ -10,8 +10,8 @@ import numpy as np
 import pybullet as bullet
 
 from physai.errors import UserError
-from physai.physics.interface import DynamicsParameters, RobotState, nominal_dynamics
-from physai.robots import RobotSpec, urdf
+from physai.physics.interface import DynamicsParameters, RobotState, loaded_links, loaded_mass, nominal_dynamics
+from physai.robots import RobotSpec, engine_urdf
 from physai.signals import Quantity
 
 _FIXED_BASE = {"useFixedBase": True, "flags": bullet.URDF_USE_INERTIA_FROM_FILE}
@@ -64,7 +64,7 @@ class PyBulletPhysics:
         try:
             with tempfile.TemporaryDirectory(prefix="physai-") as folder:
                 model = Path(folder) / "robot.urdf"
-                model.write_bytes(urdf.without_shapes(spec.urdf, spec.joints))
+                model.write_bytes(engine_urdf(spec.bodies, spec.joints))
                 most = robots_per_world(spec)
                 for first in range(0, num_robots, most):
                     robots = min(most, num_robots - first)
@@ -76,7 +76,6 @@ class PyBulletPhysics:
         self._joints: list[int] = joints
         self._links: list[int] = links
         self._unit_inertia = masses
-        self._tip = spec.moving_links.index(spec.end_effector)
         self._row = [(world.client, body) for world in self._worlds for body in world.bodies]
         n = len(joints)
         # Of all joints of all robots, in lists: what PyBullet takes and gives are single numbers.
@@ -102,8 +101,7 @@ class PyBulletPhysics:
     def _set_parameters(self, rows: np.ndarray, parameters: DynamicsParameters) -> None:
         for key, value in parameters.items():
             self._parameters[key][rows] = value
-        mass = self._parameters["link_mass"][rows].copy()
-        mass[:, self._tip] += self._parameters["payload"][rows, 0]
+        mass = loaded_mass(self._spec, {key: value[rows] for key, value in self._parameters.items()})
         damping = self._parameters["joint_damping"][rows]
         for row, masses, dampings in zip(rows.tolist(), mass.tolist(), damping.tolist(), strict=True):
             client, body = self._row[row]
@@ -174,9 +172,10 @@ class PyBulletPhysics:
         for world in self._worlds:
             bullet.syncBodyInfo(world.client)  # getJointInfo answers from a copy that changeDynamics does not reach
         for row, (client, body) in enumerate(self._row):
-            masses = np.array([bullet.getDynamicsInfo(body, link, client)[0] for link in self._links])
-            masses[self._tip] -= parameters["payload"][row, 0]
-            parameters["link_mass"][row] = masses
+            masses = dict(zip(loaded_links(self._spec), self._links, strict=True))
+            masses = {name: bullet.getDynamicsInfo(body, link, client)[0] for name, link in masses.items()}
+            masses[self._spec.end_effector] -= parameters["payload"][row, 0]
+            parameters["link_mass"][row] = [masses[name] for name in self._spec.moving_links]
             parameters["joint_damping"][row] = [bullet.getJointInfo(body, joint, client)[6] for joint in self._joints]
         return parameters
 
@@ -240,7 +239,7 @@ def _indices(world: _World, spec: RobotSpec) -> tuple[list[int], list[int], list
     infos = [bullet.getJointInfo(body, joint, client) for joint in range(bullet.getNumJoints(body, client))]
     joints = {info[1].decode(): info[0] for info in infos}
     links = {info[12].decode(): info[0] for info in infos}
-    moving = [links[name] for name in spec.moving_links]
-    dynamics = [bullet.getDynamicsInfo(body, link, client) for link in moving]
-    unit_inertia = [tuple(moment / info[0] for moment in info[2]) for info in dynamics]
-    return [joints[name] for name in spec.joints], moving, unit_inertia
+    loaded = [links[name] for name in loaded_links(spec)]
+    dynamics = [bullet.getDynamicsInfo(body, link, client) for link in loaded]
+    unit_inertia = [tuple(moment / (info[0] or 1.0) for moment in info[2]) for info in dynamics]
+    return [joints[name] for name in spec.joints], loaded, unit_inertia

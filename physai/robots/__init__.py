@@ -1,7 +1,8 @@
 """What a robot is: its URDF, its limits, its kinematics."""
 
+from physai.robots.bodies import engine_urdf
 from physai.robots.command import JointCommand
 from physai.robots.kinematics import EndEffector, ForwardKinematics
 from physai.robots.spec import RobotConfig, RobotSpec
 
-__all__ = ["EndEffector", "ForwardKinematics", "JointCommand", "RobotConfig", "RobotSpec"]
+__all__ = ["EndEffector", "ForwardKinematics", "JointCommand", "RobotConfig", "RobotSpec", "engine_urdf"]

@@ -6,11 +6,12 @@ from typing import Literal
 
 import numpy as np
 from pydantic import Field
-from urdf_parser_py.urdf import Joint
+from urdf_parser_py.urdf import Joint, Robot
 
-from physai.config import Config, PositiveFloat, nearest
+from physai.config import Config, NonNegativeFloat, PositiveFloat, nearest
 from physai.errors import UserError
-from physai.robots import urdf
+from physai.robots import bodies, urdf
+from physai.robots.bodies import Body, InertialConfig
 from physai.signals import Quantity, Signal
 
 
@@ -18,7 +19,9 @@ class RobotConfig(Config):
     """One file of ``conf/robot``.
 
     ``command`` says what drives the joints, ``command_limit`` how fast an action of 1 moves each of them, rad/s, and
-    ``position_gain`` how fast a joint that takes positions closes in on them, 1/s.
+    ``position_gain`` how fast a joint that takes positions closes in on them, 1/s. What follows stands in the place of
+    what the URDF says, or does not say: ``damping``, N·m·s/rad, and ``friction``, N·m, one value a joint, and
+    ``inertials`` of links by name.
     """
 
     name: str
@@ -29,6 +32,9 @@ class RobotConfig(Config):
     command: Literal["joint_velocity", "joint_position"]
     command_limit: list[PositiveFloat]
     position_gain: PositiveFloat
+    damping: list[NonNegativeFloat] | None
+    friction: list[NonNegativeFloat] | None
+    inertials: dict[str, InertialConfig]
 
 
 @dataclass(frozen=True)
@@ -51,8 +57,10 @@ class RobotSpec:
         damping: N·m·s/rad, [n].
         friction: Coulomb friction, N·m, [n].
         chain: Joints from the base to the end effector, in order.
-        moving_links: Links with mass that the controlled joints move.
-        link_mass: Masses of ``moving_links``, kg.
+        bodies: What engines simulate, from the base on.
+        moving_links: Bodies with mass that the controlled joints move, by the name of their first link.
+        link_mass: Their masses, kg.
+        doubtful: What its description says that can hardly be true, in words.
     """
 
     name: str
@@ -70,8 +78,10 @@ class RobotSpec:
     damping: np.ndarray
     friction: np.ndarray
     chain: tuple[Joint, ...]
+    bodies: tuple[Body, ...]
     moving_links: tuple[str, ...]
     link_mass: np.ndarray
+    doubtful: tuple[str, ...]
 
     @property
     def continuous(self) -> np.ndarray:
@@ -126,7 +136,10 @@ class RobotSpec:
         joints = [by_name[name] for name in config.joints]
         for joint in joints:
             _check_driven(path, joint)
-        for key, values in (("home", config.home), ("command_limit", config.command_limit)):
+        per_joint = {key: getattr(config, key) for key in ("home", "command_limit", "damping", "friction")}
+        for key, values in per_joint.items():
+            if values is None:
+                continue
             if len(values) != len(joints):
                 raise UserError(f"robot '{config.name}': {key} has {len(values)} values for {len(joints)} joints")
         for joint, speed in zip(joints, config.command_limit, strict=True):
@@ -136,12 +149,13 @@ class RobotSpec:
                     f"{joint.limit.velocity:g} rad/s"
                 )
 
-        moving = [links[link] for link in _links_below(config.joints[0], robot.joints, by_name)]
-        for link in moving:
-            if link.inertial is None or not link.inertial.mass:
-                raise UserError(f"{path}: link '{link.name}' moves but has no <inertial> with a mass")
-            if link.inertial.inertia is None or not np.linalg.eigvalsh(link.inertial.inertia.to_matrix())[0] > 0:
-                raise UserError(f"{path}: link '{link.name}' moves but its inertia is not positive")
+        driven = tuple(config.joints)
+        below = _links_below(config.joints[0], robot.joints, by_name)
+        together = bodies.merge(path, robot, driven, config.end_effector, config.inertials)
+        moving = [body for body in together if body.name in below and body.mass]
+        for body in together:
+            if body.joint is not None and body.joint.name in driven and not body.mass:
+                raise UserError(f"{path}: link '{body.name}' moves but has no <inertial> with a mass")
         return cls(
             name=config.name,
             urdf=path,
@@ -155,11 +169,13 @@ class RobotSpec:
             command=Quantity(config.command),
             command_limit=np.array(config.command_limit, dtype=np.float64),
             position_gain=config.position_gain,
-            damping=np.array([_dynamics(joint, "damping") for joint in joints]),
-            friction=np.array([_dynamics(joint, "friction") for joint in joints]),
+            damping=_dynamics(joints, "damping", config.damping),
+            friction=_dynamics(joints, "friction", config.friction),
             chain=tuple(chain),
-            moving_links=tuple(link.name for link in moving),
-            link_mass=np.array([link.inertial.mass for link in moving], dtype=np.float64),
+            bodies=together,
+            moving_links=tuple(body.name for body in moving),
+            link_mass=np.array([body.mass for body in moving], dtype=np.float64),
+            doubtful=_doubtful(robot, below, config),
         )
 
 
@@ -202,5 +218,16 @@ def _position_limit(joint: Joint) -> tuple[float, float]:
     return float(joint.limit.lower or 0), float(joint.limit.upper or 0)
 
 
-def _dynamics(joint: Joint, key: str) -> float:
-    return float(getattr(joint.dynamics, key, None) or 0)
+def _dynamics(joints: list[Joint], key: str, instead: list[float] | None) -> np.ndarray:
+    told = [float(getattr(joint.dynamics, key, None) or 0) for joint in joints]
+    return np.array(told if instead is None else instead, dtype=np.float64)
+
+
+def _doubtful(robot: Robot, moving: list[str], config: RobotConfig) -> tuple[str, ...]:
+    dummies = bodies.dummies(robot, moving, config.inertials)
+    if not dummies:
+        return ()
+    return (
+        f"the inertia of {', '.join(dummies)} is surely a dummy: it is the same for links of other masses; "
+        "give it under 'inertials' in the robot's YAML",
+    )

@@ -4,7 +4,6 @@ import contextlib
 import importlib.resources
 import io
 import math
-from collections.abc import Collection
 from pathlib import Path
 
 import numpy as np
@@ -85,22 +84,6 @@ def load(path: Path) -> Robot:
             return Robot.from_xml_string(etree.tostring(robot))
     except Exception as error:  # whatever the parser makes of it
         raise UserError(f"{path}: not a valid URDF: {' '.join(str(error).split()) or type(error).__name__}") from error
-
-
-def without_shapes(path: Path, joints: Collection[str]) -> bytes:
-    """Return the URDF that engines are given: only ``joints`` move, the others are welded at zero, nothing has a shape.
-
-    Raises:
-        UserError: See :func:`parse`.
-    """
-    tree = parse(path)
-    for link in tree.iter("link"):
-        for shape in link.findall("visual") + link.findall("collision"):
-            link.remove(shape)
-    for joint in tree.iter("joint"):
-        if joint.get("name") not in joints and joint.getparent().tag == "robot":
-            joint.set("type", "fixed")
-    return bytes(etree.tostring(tree, encoding="utf-8", xml_declaration=True))
 
 
 def transform(origin: Pose | None) -> np.ndarray:

@@ -83,6 +83,8 @@ def run_training(
         return summary
     agent = agent or Agent.build(config)
     with contextlib.closing(agent), stop_signals() as stop:
+        for doubt in agent.env.simulation.spec.doubtful:
+            print(doubt)
         for name in config.randomization.without_effect(agent.env.simulation.layout):
             print(f"randomization.{name} has no effect: it scales what is zero in '{config.env.robot.name}'")
         evaluation = EvaluationCallback(config)

@@ -132,6 +132,9 @@ def test_any_chain_of_turned_joints_matches_pybullet(tmp_path, seed):
         command="joint_velocity",
         command_limit=[1.0] * 3,
         position_gain=20.0,
+        damping=None,
+        friction=None,
+        inertials={},
     )
     spec = RobotSpec.from_config(config)
     joint_position = random_positions(50, 3, seed)
