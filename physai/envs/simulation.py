@@ -144,7 +144,7 @@ class Simulation:
     def _begin(self, rows: np.ndarray, ended: RobotState, parameters: np.ndarray | None = None) -> None:
         start = self._start(rows, ended)
         self.started = _replaced(self.started, rows, True)
-        self.goal = _replaced(self.goal, rows, self.task.region.sample(len(rows), self.generator))
+        self.goal = _replaced(self.goal, rows, self.task.sample_goal(len(rows), self.generator))
         self.episode_length = _replaced(self.episode_length, rows, 0)
         self.episode_rewards = _replaced(self.episode_rewards, rows, 0.0)
         self.within = _replaced(self.within, rows, 0)

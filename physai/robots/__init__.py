@@ -2,7 +2,23 @@
 
 from physai.robots.bodies import engine_urdf
 from physai.robots.command import JointCommand
-from physai.robots.kinematics import EndEffector, ForwardKinematics
+from physai.robots.kinematics import (
+    EndEffector,
+    ForwardKinematics,
+    angle_between,
+    quaternion_matrix,
+    rotation_vector,
+)
 from physai.robots.spec import RobotConfig, RobotSpec
 
-__all__ = ["EndEffector", "ForwardKinematics", "JointCommand", "RobotConfig", "RobotSpec", "engine_urdf"]
+__all__ = [
+    "EndEffector",
+    "ForwardKinematics",
+    "JointCommand",
+    "RobotConfig",
+    "RobotSpec",
+    "angle_between",
+    "engine_urdf",
+    "quaternion_matrix",
+    "rotation_vector",
+]

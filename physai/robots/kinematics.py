@@ -11,7 +11,7 @@ from physai.robots.urdf import transform
 
 
 class ForwardKinematics(nn.Module):
-    """Position of the end effector in the robot's base frame; scripts with ``torch.jit.script``.
+    """Where the end effector is in the robot's base frame; scripts with ``torch.jit.script``.
 
     By Rodrigues' formula, what a joint does to points of the link behind it is ``M(q) = A + B cos(q) + C sin(q)``,
     with three constant 4 x 4 matrices that also hold the fixed transform before the joint and the joints that are held
@@ -22,14 +22,15 @@ class ForwardKinematics(nn.Module):
         spec: The robot; its joints that are not controlled count as held at zero.
 
     Attributes:
-        reach: Length of the stretched arm from its first controlled joint to the tip, m; no point beyond it can be
-            reached.
+        shoulder: Where the first controlled joint is in the base frame, m, [3].
+        reach: Length of the stretched arm from there to the tip, m; no point beyond it can be reached.
     """
 
     def __init__(self, spec: RobotSpec) -> None:
         super().__init__()
         constant, cosine, sine = (np.zeros((len(spec.joints), 8, 4)) for _ in range(3))
         offsets: list[np.ndarray] = []
+        axes = np.zeros((len(spec.joints), 3))
         fixed = np.eye(4)
         for joint in spec.chain:
             fixed = fixed @ transform(joint.origin)
@@ -41,6 +42,7 @@ class ForwardKinematics(nn.Module):
             across = np.eye(3) - along
             cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
             row = len(offsets)
+            axes[row] = x, y, z
             constant[row, :4] = fixed
             constant[row, :3, :3] = fixed[:3, :3] @ along
             cosine[row, :3, :3] = sine[row, 4:7, :3] = fixed[:3, :3] @ across
@@ -50,6 +52,8 @@ class ForwardKinematics(nn.Module):
             fixed = np.eye(4)
         for matrix in (constant, cosine, sine):
             matrix[-1] = matrix[-1] @ fixed  # the last link's frame moves to the tip
+        axes[-1] = fixed[:3, :3].T @ axes[-1]
+        self.shoulder = offsets[0].copy()
         self.reach = float(sum(np.linalg.norm(offset) for offset in offsets[1:]) + np.linalg.norm(fixed[:3, 3]))
         self.constant: Tensor
         self.cosine: Tensor
@@ -57,6 +61,8 @@ class ForwardKinematics(nn.Module):
         self.register_buffer("constant", torch.from_numpy(constant).float())  # [n, 8, 4]
         self.register_buffer("cosine", torch.from_numpy(cosine).float())  # [n, 8, 4]
         self.register_buffer("sine", torch.from_numpy(sine).float())  # [n, 8, 4]
+        self.axes: Tensor
+        self.register_buffer("axes", torch.from_numpy(axes).float())  # [n, 3], in the frame of the link behind
 
     def forward(self, joint_position: Tensor) -> Tensor:
         """Map joint positions [N, n] in rad to end-effector positions [N, 3] in m."""
@@ -69,14 +75,66 @@ class ForwardKinematics(nn.Module):
         Returns:
             [N, 3, n + 1]: the Jacobian in m/rad, then the end effector in m.
         """
+        return self._linearize(self._motion(cosine, sine))
+
+    @torch.jit.export
+    def linearize_pose(self, cosine: Tensor, sine: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Map cosines and sines of joint positions, [N, n] each, to pose and slopes.
+
+        Returns:
+            What ``linearize`` does, [N, 3, n + 1]; the end effector's rotation matrix, [N, 3, 3]; and its angular
+            Jacobian in the base frame, [N, 3, n]: the lower half of the geometric Jacobian.
+        """
+        motion = self._motion(cosine, sine)
+        rotation = motion[:, 0, :3, :3]
+        turning = [torch.matmul(rotation, self.axes[0])]
+        for joint in range(1, motion.shape[1]):
+            rotation = torch.bmm(rotation, motion[:, joint, :3, :3])
+            turning.append(torch.matmul(rotation, self.axes[joint]))
+        return self._linearize(motion), rotation, torch.stack(turning, dim=2)
+
+    def _motion(self, cosine: Tensor, sine: Tensor) -> Tensor:
         cosine, sine = cosine.unsqueeze(-1).unsqueeze(-1), sine.unsqueeze(-1).unsqueeze(-1)
-        motion = torch.addcmul(torch.addcmul(self.constant, self.cosine, cosine), self.sine, sine)  # [N, n, 8, 4]
+        return torch.addcmul(torch.addcmul(self.constant, self.cosine, cosine), self.sine, sine)  # [N, n, 8, 4]
+
+    def _linearize(self, motion: Tensor) -> Tensor:
         last = motion.shape[1] - 1
         columns = torch.stack([motion[:, last, 4:, 3], motion[:, last, :4, 3]], dim=2)
         for joint in range(last - 1, -1, -1):
             moved = torch.bmm(motion[:, joint], columns)  # [N, 8, slopes of the joints so far + 1]
             columns = torch.cat([moved[:, 4:, -1:], moved[:, :4]], dim=2)
         return columns[:, :3]
+
+
+def quaternion_matrix(quaternion: Tensor) -> Tensor:
+    """Map quaternions x, y, z, w [N, 4] of any length but zero to rotation matrices [N, 3, 3]."""
+    q = quaternion / torch.linalg.vector_norm(quaternion, dim=1, keepdim=True).clamp(min=1e-9)
+    x, y, z, w = q[:, 0], q[:, 1], q[:, 2], q[:, 3]
+    first = [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)]
+    second = [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)]
+    third = [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)]
+    return torch.stack(first + second + third, dim=1).view(-1, 3, 3)
+
+
+def rotation_vector(start: Tensor, end: Tensor) -> Tensor:
+    """Return the turn that takes rotation matrices ``start`` to ``end``, [N, 3, 3] each: axis times angle, rad, [N, 3].
+
+    Near half a turn the axis may be its opposite: both ways are as long.
+    """
+    turn = torch.bmm(end, start.transpose(1, 2))
+    axis = torch.stack(
+        [turn[:, 2, 1] - turn[:, 1, 2], turn[:, 0, 2] - turn[:, 2, 0], turn[:, 1, 0] - turn[:, 0, 1]], dim=1
+    )
+    length = torch.linalg.vector_norm(axis, dim=1, keepdim=True).clamp(min=1e-9)
+    return axis / length * angle_between(start, end)
+
+
+def angle_between(start: Tensor, end: Tensor) -> Tensor:
+    """Return the angle between rotation matrices [N, 3, 3], rad, [N, 1]; exact for small ones, too."""
+    # |R1 - R2|² = 8 sin²(θ/2), and the trace of R1ᵀR2 is 4 cos²(θ/2) - 1.
+    sine = torch.linalg.vector_norm((end - start).flatten(1), dim=1) / 8**0.5
+    cosine = torch.sqrt(((start * end).flatten(1).sum(dim=1) + 1.0).clamp(min=0.0)) / 2
+    return 2 * torch.atan2(sine, cosine).unsqueeze(1)
 
 
 class EndEffector:

@@ -1,6 +1,6 @@
 """What crosses a boundary, declared once: specs, spaces, policy files, checks and messages follow from it."""
 
-from physai.signals.region import Box, Region, Ring
+from physai.signals.region import Ball, Box, Reachable, Region, Ring
 from physai.signals.signal import Quantity, Signal, Tolerance
 
-__all__ = ["Box", "Quantity", "Region", "Ring", "Signal", "Tolerance"]
+__all__ = ["Ball", "Box", "Quantity", "Reachable", "Region", "Ring", "Signal", "Tolerance"]

@@ -13,6 +13,7 @@ class Quantity(str, Enum):
     JOINT_POSITION = "joint_position"  # rad, one a joint
     JOINT_VELOCITY = "joint_velocity"  # rad/s, one a joint
     POSITION = "position"  # a point in a frame, m
+    POSE = "pose"  # a point in a frame, m, then a quaternion x, y, z, w; its opposite is the same pose
     MEMORY = "memory"  # what a policy remembers
     VIEW = "view"  # what a policy sees, of more than one quantity
 

@@ -2,5 +2,8 @@
 
 from physai.tasks.interface import ObservationModule, Step, Task
 from physai.tasks.reach import Reach
+from physai.tasks.reach_pose import ReachPose
+from physai.tasks.reach_position import ReachPosition
+from physai.tasks.reachable import ReachableGoals
 
-__all__ = ["ObservationModule", "Reach", "Step", "Task"]
+__all__ = ["ObservationModule", "Reach", "ReachPose", "ReachPosition", "ReachableGoals", "Step", "Task"]

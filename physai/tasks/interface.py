@@ -82,6 +82,10 @@ class Task(Protocol):
     def rewards(self, step: Step, success: np.ndarray) -> dict[str, np.ndarray]:
         """Return the terms of the reward by name, [N] each; the reward is their sum."""
 
+    def sample_goal(self, rows: int, generator: torch.Generator) -> np.ndarray:
+        """Draw goals of episodes, [rows, g]."""
+        return self.region.sample(rows, generator)
+
     @torch.no_grad()
     def error(self, state: RobotState, goal: np.ndarray) -> np.ndarray:
         """Return how far the robots are from their goals [N, g], one column a tolerance, [N, e]."""

@@ -1,19 +1,20 @@
 """Reach: bring the end effector to a point of the base frame's x-y plane."""
 
 import math
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 import torch
 from pydantic import Field
 from torch import Tensor
 
-from physai.config import Count, NonNegativeFloat, PositiveFloat
+from physai.config import PositiveFloat
 from physai.errors import UserError
 from physai.physics import RobotState
 from physai.robots import EndEffector, ForwardKinematics, RobotSpec
 from physai.signals import Quantity, Ring, Signal, Tolerance
-from physai.tasks.interface import ObservationModule, Step, Task
+from physai.tasks.interface import ObservationModule
+from physai.tasks.reaching import Reaching
 
 
 class ReachObservation(ObservationModule):
@@ -68,18 +69,15 @@ class ReachObservation(ObservationModule):
         return torch.linalg.vector_norm(end_effector - goal, dim=1, keepdim=True)
 
 
-class Reach(Task):
-    """Goals on a ring around the base; reward is minus the distance, plus a bonus for success, which ends the episode.
+class Reach(Reaching):
+    """Goals on a ring around the base, in its x-y plane.
 
     Args:
         spec: The robot.
         kinematics: Its forward kinematics.
         goal_radius: Inner and outer radius of the ring, m.
         tolerance: Distance that counts as reached, m.
-        success_reward: Bonus for success.
-        settle: How long the end effector must stay there to succeed, s; with 0 touching the goal is enough.
-        smoothness: Weight of what changes of the action cost: their mean over the joints, as a share of the action.
-        max_steps: Control steps until an episode is truncated.
+        **judging: How a step is judged, see :class:`Reaching`.
 
     Raises:
         UserError: If the robot cannot reach the goals.
@@ -91,11 +89,9 @@ class Reach(Task):
         kinematics: ForwardKinematics,
         goal_radius: Annotated[list[PositiveFloat], Field(min_length=2, max_length=2)],
         tolerance: PositiveFloat,
-        success_reward: NonNegativeFloat,
-        settle: NonNegativeFloat,
-        smoothness: NonNegativeFloat,
-        max_steps: Count,
+        **judging: Any,
     ) -> None:
+        super().__init__(spec, (Tolerance("distance", "m", tolerance),), (1.0,), **judging)
         inner, outer = goal_radius
         if inner >= outer:
             raise UserError(f"env.task.goal_radius: the inner radius {inner} must be below the outer radius {outer}")
@@ -106,28 +102,10 @@ class Reach(Task):
         self.region = Ring(inner, outer)
         low, high = (tuple(bound.tolist()) for bound in self.region.bounds)
         self.goal = Signal("goal", Quantity.POSITION, (2,), low, high, ("x", "y"), spec.base)
-        self.tolerances = (Tolerance("distance", "m", tolerance),)
         self.module = ReachObservation(spec, kinematics, tolerance)
         self.observation = _observation(spec, self.goal, kinematics.reach)
-        self.max_steps = max_steps
-        self._success_reward, self._settle, self._smoothness = success_reward, settle, smoothness
         self._end_effector = EndEffector(kinematics)
         self._continuous = spec.continuous.nonzero()[0]
-
-    def success(self, step: Step) -> np.ndarray:
-        """Whether the end effector is near enough, and has been for long enough."""
-        return (step.held > 0) & (step.held >= self._settle - 1e-9)
-
-    def terminated(self, step: Step, success: np.ndarray) -> np.ndarray:
-        """Success ends the episode."""
-        return success
-
-    def rewards(self, step: Step, success: np.ndarray) -> dict[str, np.ndarray]:
-        """Minus the distance, m, the bonus, and what changing the action costs, if it does."""
-        terms = {"distance": -step.error[:, 0], "success": self._success_reward * success}
-        if self._smoothness:
-            terms["smoothness"] = -self._smoothness * np.abs(step.action - step.last_action).mean(axis=1)
-        return terms
 
     # The same as the module says, without the cost of torch's calls.
 
