@@ -1,7 +1,7 @@
 """physai: the shortest trustworthy way from a simulated robot arm to a policy on a ROS 2 robot.
 
-Importing it registers ``physai/Reacher-v0``, ``physai/KukaReacher-v0`` and, for a robot behind ROS topics,
-``physai/RosReacher-v0`` with Gymnasium, where that is installed, and imports nothing heavy.
+Importing it registers ``physai/Reacher-v0``, ``physai/PandaReach-v0`` and so on with Gymnasium, where that is installed:
+an id for each file of ``conf/env``. It imports nothing heavy.
 """
 
 import importlib.util
@@ -15,7 +15,15 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 __all__ = ["UserError", "make_env"]
 
-_GYMNASIUM_IDS = {"Reacher": "reacher", "KukaReacher": "kuka_reacher", "RosReacher": "ros_reacher"}
+_GYMNASIUM_IDS = {
+    "Reacher": "reacher",
+    "KukaReacher": "kuka_reacher",
+    "PandaReach": "panda_reach",
+    "PandaPose": "panda_pose",
+    "Kuka7Reach": "kuka7_reach",
+    "XarmReach": "xarm_reach",
+    "RosReacher": "ros_reacher",
+}
 
 
 def make_env(*args: Any, **kwargs: Any) -> "TransformedRobotEnv":

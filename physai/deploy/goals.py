@@ -7,7 +7,9 @@ import numpy as np
 
 from physai.deploy.joints import to_floats
 from physai.deploy.metadata import Metadata
-from physai.signals import Signal
+from physai.signals import Quantity, Signal
+
+_LENGTH = 0.1  # by which that of a quaternion may differ from 1: digits that were left out, not a forgotten orientation
 
 
 @dataclass(frozen=True)
@@ -53,12 +55,22 @@ def accept(goal: Goal, metadata: Metadata, project: bool) -> tuple[np.ndarray, b
         raise GoalError("malformed", "its frame is no name")
     if goal.frame != signal.frame and signal.frame:
         raise GoalError("wrong frame", f"frame '{goal.frame}' is not '{signal.frame}'")
+    if signal.quantity is Quantity.POSE:
+        value = _normalized(value)
     if metadata.region.contains(value):
         return value, False
     projected = metadata.region.project(value) if project else None
     if projected is None:
         raise GoalError("unreachable", metadata.region.describe(value))
     return projected, True
+
+
+def _normalized(pose: np.ndarray) -> np.ndarray:
+    """The same pose with a quaternion of length 1, of which the last number is not negative."""
+    length = float(np.linalg.norm(pose[3:]))
+    if not abs(length - 1.0) < _LENGTH:
+        raise GoalError("not a rotation", f"its quaternion has the length {length:.3f}, not 1")
+    return np.concatenate([pose[:3], pose[3:] / (length if pose[6] >= 0 else -length)])
 
 
 def _names(goal: Goal) -> tuple[str, ...]:

@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 import pybullet as bullet
+from scipy.spatial.transform import Rotation
 
 from physai.robots import RobotSpec
 
@@ -52,6 +53,7 @@ class Viewer:
         if upright:
             self._markers.append((self._cylinder(0.2 * tolerance, height, green), 0.5 * height))
         self._ball = self._body_of(bullet.GEOM_SPHERE, green, radius=tolerance)  # of a goal in space
+        self._frame = self._make_frame(0.16 * reach)  # and what shows how it is turned
         half = [1.6 * reach, 1.6 * reach, 0.005]
         plate = self._body_of(bullet.GEOM_BOX, (0.97, 0.97, 0.98, 1), halfExtents=half)
         bullet.resetBasePositionAndOrientation(plate, (0, 0, floor - 0.005), (0, 0, 0, 1), self._client)
@@ -66,24 +68,41 @@ class Viewer:
     def _cylinder(self, radius: float, length: float, color: tuple[float, float, float, float]) -> int:
         return self._body_of(bullet.GEOM_CYLINDER, color, radius=radius, length=length)
 
+    def _make_frame(self, length: float) -> int:
+        """Axes x, y, z in red, green and blue, as one body whose origin is theirs."""
+        turns = [Rotation.from_euler("y", 90, degrees=True), Rotation.from_euler("x", -90, degrees=True)]
+        orientations = [turn.as_quat().tolist() for turn in (*turns, Rotation.identity())]
+        shapes = bullet.createVisualShapeArray(
+            shapeTypes=[bullet.GEOM_CYLINDER] * 3,
+            radii=[0.045 * length] * 3,
+            lengths=[length] * 3,
+            rgbaColors=[(0.85, 0.1, 0.1, 1), (0.1, 0.7, 0.1, 1), (0.1, 0.2, 0.9, 1)],
+            visualFramePositions=(np.eye(3) * length / 2).tolist(),
+            visualFrameOrientations=orientations,
+            physicsClientId=self._client,
+        )
+        return bullet.createMultiBody(baseVisualShapeIndex=shapes, physicsClientId=self._client)
+
     def _body_of(self, kind: int, color: tuple[float, float, float, float], **size: Any) -> int:
         shape = bullet.createVisualShape(kind, rgbaColor=color, physicsClientId=self._client, **size)
         return bullet.createMultiBody(baseVisualShapeIndex=shape, physicsClientId=self._client)
 
     def show(self, joint_position: np.ndarray, goal: np.ndarray) -> np.ndarray | None:
-        """Show a pose [n], rad, and a goal in the plane [2] or in space [3], m.
+        """Show a pose [n], rad, and a goal in the plane [2] or in space [3], m, or a pose [7].
 
         Returns:
             An image [height, width, 3] uint8, or None with a window.
         """
         for joint, position in zip(self._joints, joint_position.tolist(), strict=True):
             bullet.resetJointState(self._body, joint, position, 0.0, self._client)
-        x, y, *height_of_goal = goal.tolist()
-        flat = not height_of_goal
-        for marker, z in [*self._markers, (self._ball, 0.0 if flat else height_of_goal[0])]:
-            shown = flat != (marker == self._ball)
+        x, y, *above = goal.tolist()
+        flat, turned = not above, len(above) > 1
+        for marker, z in [*self._markers, (self._ball, 0.0 if flat else above[0])]:
+            shown = flat != (marker == self._ball) and not turned
             place = (x, y, z) if shown else _OUT_OF_SIGHT
             bullet.resetBasePositionAndOrientation(marker, place, (0, 0, 0, 1), self._client)
+        place, turn = ((x, y, above[0]), above[1:]) if turned else (_OUT_OF_SIGHT, (0, 0, 0, 1))
+        bullet.resetBasePositionAndOrientation(self._frame, place, turn, self._client)
         if self._window:
             return None
         width, height = self._size

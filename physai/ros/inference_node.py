@@ -90,7 +90,8 @@ class InferenceNode(StoppableNode[InferenceConfig]):
         self._states = self.create_publisher(String, "~/state", qos.LATCHED)
         self._estopped = self.create_publisher(Bool, "~/estopped", qos.LATCHED)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
-        self.create_subscription(goals.goal_type(policy.metadata.goal), "~/goal", self._take_goal, 1)
+        taken = self.create_subscription(goals.goal_type(policy.metadata.goal), "~/goal", self._take_goal, 1)
+        self._goal_topic = taken.topic_name
         self._stop_topic = EmergencyStopTopic(self, lambda: self._emergency_stop(f"by {EMERGENCY_STOP}"))
         self.create_service(SetBool, "~/enable", self._enable)
         self.offer("~/estop", self._estop)
@@ -279,6 +280,11 @@ class InferenceNode(StoppableNode[InferenceConfig]):
         values["counters"]["states of other joints"] = self._robot.others
         values["counters"]["emergency stop file failures"] = self._stop_file.failures
         values["counters"]["watchdog silences"] = self._commands.silences
+        goal = self._controller.policy.metadata.goal
+        if unheard := goals.other_types(self, self._goal_topic, goal):
+            said = f"goals are a {goals.goal_type(goal).__name__} for this policy; unheard on {self._goal_topic}: {unheard}"
+            values["goals of another type"] = said
+            self.get_logger().warning(said, throttle_duration_sec=10.0)
         now = self.get_clock().now().to_msg()
         self._diagnostics.publish(diagnose(self.get_name(), now, self._controller.policy, values))
 

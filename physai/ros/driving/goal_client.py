@@ -55,7 +55,7 @@ class GoalResult:
 
     def describe(self) -> str:
         """One line."""
-        where = f"({', '.join(f'{number:+.2f}' for number in self.goal)}) {self.unit}"
+        where = f"({', '.join(f'{number:+.2f}' for number in self.goal)}) {self.unit}".rstrip()
         if self.reached is None or self.error is None:
             return f"{where}  not reached"
         worst = int(np.argmax(self.error / [tolerance.value for tolerance in self.tolerances]))

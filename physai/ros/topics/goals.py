@@ -4,18 +4,20 @@ from collections.abc import Sequence
 from typing import Any
 
 from builtin_interfaces.msg import Time
-from geometry_msgs.msg import PointStamped
+from geometry_msgs.msg import PointStamped, PoseStamped
+from rclpy.node import Node
 from sensor_msgs.msg import JointState
 
 from physai.deploy import Goal
 from physai.errors import UserError
 from physai.signals import Quantity, Signal
 
-_TYPES = {Quantity.POSITION: PointStamped, Quantity.JOINT_POSITION: JointState}
+_TYPES = {Quantity.POSITION: PointStamped, Quantity.POSE: PoseStamped, Quantity.JOINT_POSITION: JointState}
+_POSITION, _ORIENTATION = ("x", "y", "z"), ("x", "y", "z", "w")
 
 
 def goal_type(signal: Signal) -> Any:
-    """Return the message type of a goal signal: PointStamped or JointState.
+    """Return the message type of a goal signal: PointStamped, PoseStamped or JointState.
 
     Raises:
         UserError: If there is none for its quantity.
@@ -29,6 +31,10 @@ def from_message(message: Any, signal: Signal) -> Goal:
     """Take a goal out of a message of ``goal_type``."""
     if signal.quantity is Quantity.JOINT_POSITION:
         return Goal(message.position.tolist(), names=tuple(message.name))
+    if signal.quantity is Quantity.POSE:
+        position, orientation = message.pose.position, message.pose.orientation
+        value = [getattr(position, axis) for axis in _POSITION] + [getattr(orientation, axis) for axis in _ORIENTATION]
+        return Goal(value, message.header.frame_id)
     return Goal([getattr(message.point, axis) for axis in signal.labels], message.header.frame_id)
 
 
@@ -38,14 +44,27 @@ def to_message(value: Sequence[float], signal: Signal, stamp: Time) -> Any:
     message.header.stamp = stamp
     if signal.quantity is Quantity.JOINT_POSITION:
         message.name, message.position = list(signal.labels), [float(number) for number in value]
+        return message
+    message.header.frame_id = signal.frame
+    if signal.quantity is Quantity.POSE:
+        for axis, number in zip(_POSITION, value[:3], strict=True):
+            setattr(message.pose.position, axis, float(number))
+        for axis, number in zip(_ORIENTATION, value[3:], strict=True):
+            setattr(message.pose.orientation, axis, float(number))
     else:
-        message.header.frame_id = signal.frame
         for axis, number in zip(signal.labels, value, strict=True):
             setattr(message.point, axis, float(number))
     return message
 
 
+def other_types(node: Node, topic: str, signal: Signal) -> list[str]:
+    """Types of messages that others send to a goal topic, and that do not arrive: they are not the goal signal's."""
+    wanted = goal_type(signal)
+    own = f"{wanted.__module__.partition('.')[0]}/msg/{wanted.__name__}"
+    return sorted({info.topic_type for info in node.get_publishers_info_by_topic(topic)} - {own})
+
+
 def describe(goal: Goal, signal: Signal) -> str:
     """Say what a goal is, for the log."""
     numbers = ", ".join(f"{number:g}" for number in goal.value)
-    return f"({numbers}) {signal.unit}" + (f", in '{goal.frame}'" if goal.frame else "")
+    return f"({numbers}) {signal.unit}".rstrip() + (f", in '{goal.frame}'" if goal.frame else "")
