@@ -28,6 +28,7 @@ _PARTS: dict[str, tuple[str, ...]] = {
     "physai.algorithms": (),
     "physai.physics": (),  # not physai.ros: nobody trains there, and nobody's config may move a robot
     "physai.policies": (),
+    "physai.signals": (),
     "physai.tasks": (),
     "physai.training.mlflow": ("torchrl.record.loggers.common.Logger",),
     "physai.training.wandb": ("torchrl.record.loggers.common.Logger",),

@@ -1,7 +1,7 @@
 """Pictures of drives: where an arm went; no ROS in here."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -9,7 +9,9 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.patches import Annulus, Circle
+from mpl_toolkits.mplot3d.art3d import Line3DCollection
 from omegaconf import DictConfig
+from scipy.spatial.transform import Rotation
 
 from physai.config import validate
 from physai.deploy import Policy
@@ -22,7 +24,9 @@ if TYPE_CHECKING:
 
 
 def draw_drive(record: "Record", policy: Policy, output: Path) -> None:
-    """Draw the end effector's path from above, with goals that are places (left), and its errors over time (right).
+    """Draw the end effector's path with goals that are places (left), and its errors over time (right).
+
+    A path among goals in the plane, or among configurations, is seen from above, one among goals in space as it is.
 
     Args:
         record: At least one goal.
@@ -30,19 +34,54 @@ def draw_drive(record: "Record", policy: Policy, output: Path) -> None:
         output: The PNG to write.
     """
     figure = Figure(figsize=(12, 5.4), layout="constrained")
-    above, over = figure.subplots(1, 2, width_ratios=[1, 1.25])
-    _draw_path(figure, above, record, policy)
-    _draw_errors(over, record, policy)
+    grid = figure.add_gridspec(1, 2, width_ratios=[1, 1.25])
+    if len(policy.metadata.goal.labels) > 2 and policy.metadata.goal.quantity is not Quantity.JOINT_POSITION:
+        _draw_path_in_space(figure, figure.add_subplot(grid[0], projection="3d"), record, policy)
+    else:
+        _draw_path(figure, figure.add_subplot(grid[0]), record, policy)
+    _draw_errors(figure.add_subplot(grid[1]), record, policy)
     figure.savefig(output, dpi=120)
 
 
-def _draw_path(figure: Figure, axes: Axes, record: "Record", policy: Policy) -> None:
-    metadata, started = policy.metadata, record.results[0].sent
-    config = validate(EnvConfig, DictConfig(metadata.raw["config"]["env"]))
+def _path(record: "Record", policy: Policy) -> tuple[ForwardKinematics, np.ndarray, np.ndarray]:
+    """The robot's kinematics; since the first goal was sent, times, s, [T], and its end effector, m, [T, 3]."""
+    config = validate(EnvConfig, DictConfig(policy.metadata.raw["config"]["env"]))
     kinematics = ForwardKinematics(RobotSpec.from_config(config.robot))
-    times = np.array(record.times)
-    moving = times >= started
-    points = kinematics(torch.tensor(np.array(record.positions)[moving], dtype=torch.float32))[:, :2].numpy()
+    times, positions = np.array(record.times), np.array(record.positions)
+    moving = times >= record.results[0].sent
+    points = kinematics(torch.from_numpy(positions[moving]).float()).numpy()
+    return kinematics, times[moving] - record.results[0].sent, points
+
+
+def _draw_path_in_space(figure: Figure, axes: Any, record: "Record", policy: Policy) -> None:
+    metadata = policy.metadata
+    _, times, points = _path(record, policy)
+    path = Line3DCollection(np.stack([points[:-1], points[1:]], axis=1), cmap="viridis", linewidth=1.5)
+    path.set_array(times[:-1])
+    axes.add_collection(path)
+    for number, result in enumerate(record.results, 1):
+        x, y, z = result.goal[:3]
+        axes.scatter([x], [y], [z], s=60, alpha=0.6, color="tab:green" if result.kept else "tab:red")
+        axes.text(x, y, z, f" {number}", fontsize=9, color="0.2")
+        if metadata.goal.quantity is Quantity.POSE:
+            turned = Rotation.from_quat(result.goal[3:]).as_matrix().T
+            for axis, color in zip(turned, ("tab:red", "tab:green", "tab:blue"), strict=True):
+                axes.quiver(x, y, z, *(0.08 * axis), color=color, linewidth=1.2, arrow_length_ratio=0.0)
+    around = np.concatenate([points, [result.goal[:3] for result in record.results], np.zeros((1, 3))])
+    low, high = around.min(axis=0) - 0.05, around.max(axis=0) + 0.05
+    axes.plot([0, 0], [0, 0], [low[2], 0], "s-", color="0.2", markersize=7)
+    axes.text(0, 0, 0, " base", color="0.2")
+    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
+    axes.set(xlabel="x (m)", ylabel="y (m)", zlabel="z (m)")
+    axes.set_box_aspect(high - low)
+    axes.set_title(f"Path of the end effector of '{metadata.robot}' among {len(record.results)} goals")
+    figure.colorbar(path, ax=axes, label="time (s)", shrink=0.8)
+
+
+def _draw_path(figure: Figure, axes: Axes, record: "Record", policy: Policy) -> None:
+    metadata = policy.metadata
+    kinematics, times, points = _path(record, policy)
+    points = points[:, :2]
     widest = 1.15 * kinematics.reach
     if isinstance(metadata.region, Ring):
         outer = metadata.region.outer
@@ -55,7 +94,7 @@ def _draw_path(figure: Figure, axes: Axes, record: "Record", policy: Policy) -> 
             axes.add_patch(Circle(where, size, facecolor=color, alpha=0.25, edgecolor=color))
             axes.annotate(str(number), where, ha="center", va="center", fontsize=9, color="0.2")
     path = LineCollection(list(np.stack([points[:-1], points[1:]], axis=1)), cmap="viridis", linewidth=1.5)
-    path.set_array(times[moving][:-1] - started)
+    path.set_array(times[:-1])
     axes.add_collection(path)
     axes.plot(0, 0, "s", color="0.2", markersize=7)
     axes.annotate("base", (0, 0), xytext=(6, 6), textcoords="offset points", color="0.2")
