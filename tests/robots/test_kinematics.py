@@ -2,9 +2,19 @@ import numpy as np
 import pybullet as bullet
 import pytest
 import torch
+from hypothesis import assume, given
+from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from physai.robots import EndEffector, ForwardKinematics, RobotConfig, RobotSpec
+from physai.robots import (
+    EndEffector,
+    ForwardKinematics,
+    RobotConfig,
+    RobotSpec,
+    angle_between,
+    quaternion_matrix,
+    rotation_vector,
+)
 from physai.robots.urdf import resolve
 
 SEVEN = [f"lbr_iiwa_joint_{number}" for number in range(1, 8)]
@@ -53,7 +63,8 @@ def reference(spec: RobotSpec, joint_position: np.ndarray) -> np.ndarray:
             before[:3, 3] = joint.origin.xyz
             pose = pose @ before
         angle = angles.get(joint.name, 0.0)
-        x, y, z = np.array(joint.axis) / np.linalg.norm(joint.axis) if joint.axis is not None else (0.0, 0.0, 1.0)
+        axis = np.array(joint.axis if joint.axis is not None and any(joint.axis) else (0.0, 0.0, 1.0))
+        x, y, z = axis / np.linalg.norm(axis)
         cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
         turn = np.eye(4)
         turn[:3, :3] = np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
@@ -214,3 +225,72 @@ def test_the_end_effector_without_torch_is_that_of_the_module(spec):
 @pytest.mark.parametrize("joints", [1, 7])
 def test_the_end_effector_without_torch_is_that_of_the_module_for_any_number_of_joints(kuka_reacher, joints):
     assert_same_in_numbers_and_arrays(first_joints(kuka_reacher.robot, joints))
+
+
+def turned(spec: RobotSpec, joint_position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Where PyBullet puts the end effector, as a quaternion x, y, z, w, [N, 4], and its angular Jacobian, [N, 3, n]."""
+    client = bullet.connect(bullet.DIRECT)
+    try:
+        body = bullet.loadURDF(str(spec.urdf), useFixedBase=True, physicsClientId=client)
+        infos = [bullet.getJointInfo(body, index, client) for index in range(bullet.getNumJoints(body, client))]
+        joints = {info[1].decode(): info[0] for info in infos}
+        tip = {info[12].decode(): info[0] for info in infos}[spec.end_effector]
+        free = [info[0] for info in infos if info[2] != bullet.JOINT_FIXED]
+        columns = [free.index(joints[name]) for name in spec.joints]
+        quaternions, jacobians = [], []
+        for row in joint_position.tolist():
+            angles = dict(zip((joints[name] for name in spec.joints), row, strict=True))
+            for joint, value in angles.items():
+                bullet.resetJointState(body, joint, value, physicsClientId=client)
+            quaternions.append(bullet.getLinkState(body, tip, computeForwardKinematics=1, physicsClientId=client)[5])
+            place = [angles.get(joint, 0.0) for joint in free]
+            zeros = [0.0] * len(free)
+            _, angular = bullet.calculateJacobian(body, tip, [0.0] * 3, place, zeros, zeros, client)
+            jacobians.append(np.array(angular)[:, columns])
+        return np.array(quaternions), np.array(jacobians)
+    finally:
+        bullet.disconnect(client)
+
+
+def test_orientation_and_angular_jacobian_are_pybullet_s(spec):
+    kinematics = torch.jit.script(ForwardKinematics(spec))
+    low, high = np.nan_to_num(spec.position_limit, posinf=6.0, neginf=-6.0).T
+    q = np.random.default_rng(0).uniform(low, high, (20, len(spec.joints)))
+    joint_position = torch.from_numpy(q).float()
+    linear, rotation, angular = kinematics.linearize_pose(torch.cos(joint_position), torch.sin(joint_position))
+    quaternion, jacobian = turned(spec, q)
+    np.testing.assert_allclose(rotation.numpy(), Rotation.from_quat(quaternion).as_matrix(), atol=2e-5)
+    np.testing.assert_allclose(angular.numpy(), jacobian, atol=2e-5)
+    assert torch.equal(linear, kinematics.linearize(torch.cos(joint_position), torch.sin(joint_position)))
+
+
+def test_the_angular_jacobian_is_how_a_rotation_changes(spec):
+    kinematics = ForwardKinematics(spec).double()
+    q = torch.from_numpy(np.random.default_rng(1).uniform(-1, 1, (1, len(spec.joints))))
+    _, before, angular = kinematics.linearize_pose(torch.cos(q), torch.sin(q))
+    for joint in range(len(spec.joints)):
+        moved = q.clone()
+        moved[0, joint] += 1e-6
+        _, after, _ = kinematics.linearize_pose(torch.cos(moved), torch.sin(moved))
+        np.testing.assert_allclose(rotation_vector(before, after)[0] / 1e-6, angular[0, :, joint], atol=1e-4)
+
+
+@given(st.lists(st.floats(-1, 1), min_size=4, max_size=4), st.lists(st.floats(-1, 1), min_size=4, max_size=4))
+def test_the_turn_between_two_rotations_is_the_shorter_way_for_a_quaternion_and_its_opposite(first, second):
+    assume(np.linalg.norm(first) > 0.1)
+    assume(np.linalg.norm(second) > 0.1)
+    start, end = (quaternion_matrix(torch.tensor([q], dtype=torch.float64)) for q in (first, second))
+    assert torch.equal(start, quaternion_matrix(-torch.tensor([first], dtype=torch.float64)))
+    np.testing.assert_allclose(start[0], Rotation.from_quat(first).as_matrix(), atol=1e-9)
+    expected = (Rotation.from_quat(second) * Rotation.from_quat(first).inv()).as_rotvec()
+    angle = float(angle_between(start, end))
+    assert angle == pytest.approx(np.linalg.norm(expected), abs=1e-6)
+    if angle < np.pi - 1e-3:
+        np.testing.assert_allclose(rotation_vector(start, end)[0], expected, atol=1e-6)
+
+
+def test_no_turn_and_half_a_turn_are_told_in_single_precision():
+    same = quaternion_matrix(torch.tensor([[0.3, -0.2, 0.5, 0.1]]))
+    assert torch.equal(rotation_vector(same, same), torch.zeros(1, 3))
+    half = torch.bmm(quaternion_matrix(torch.tensor([[1.0, 0.0, 0.0, 0.0]])), same)
+    assert float(angle_between(same, half)) == pytest.approx(np.pi, abs=1e-3)

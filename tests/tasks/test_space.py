@@ -1,0 +1,178 @@
+"""Goals in space: positions and poses, where they are drawn, and what arms see of them."""
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from physai.envs.simulation import Simulation
+from physai.errors import UserError
+from physai.physics import RobotState
+from physai.signals import Quantity
+
+SPACE = ["panda_reach", "panda_pose", "kuka7_reach", "xarm_reach"]
+
+
+@pytest.fixture(scope="module")
+def simulate(env_config):
+    made = {}
+
+    def make(name: str, *overrides: str) -> Simulation:
+        key = name, *overrides
+        if key not in made:
+            made[key] = Simulation(env_config(name, "physics=mujoco", *overrides), 8, seed=0)
+            made[key].reset()
+        return made[key]
+
+    yield make
+    for simulation in made.values():
+        simulation.close()
+
+
+def generator(seed=0):
+    return torch.Generator().manual_seed(seed)
+
+
+def inside_of_limits(simulation, rows, seed=0):
+    """Joint positions [rows, n], rad."""
+    low, high = simulation.spec.position_limit.T
+    return np.random.default_rng(seed).uniform(low, high, (rows, len(low)))
+
+
+def state_at(joint_position):
+    return RobotState(joint_position, np.zeros_like(joint_position))
+
+
+def poses(simulation, joint_position):
+    """Where the end effector is: positions [N, 3] and rotation matrices [N, 3, 3]."""
+    q = torch.from_numpy(joint_position).float()
+    linear, rotation, _ = simulation.kinematics.linearize_pose(torch.cos(q), torch.sin(q))
+    return linear[:, :, -1].double().numpy(), rotation.double().numpy()
+
+
+@pytest.mark.parametrize("name", SPACE)
+def test_what_is_seen_is_within_its_bounds_and_scripts_bit_for_bit(simulate, name):
+    task = simulate(name).task
+    q = inside_of_limits(simulate(name), 50)
+    goal = task.sample_goal(50, generator())
+    sensed = [torch.from_numpy(array).float() for array in (q, np.ones_like(q), goal)]
+    observation, features = task.module(*sensed)
+    low, high = task.observation.bounds
+    assert ((observation.numpy() >= low) & (observation.numpy() <= high)).all()
+    assert torch.isfinite(features).all()
+    scripted = torch.jit.script(task.module)
+    assert all(torch.equal(*pair) for pair in zip(scripted(*sensed), (observation, features), strict=True))
+    assert torch.equal(scripted.error(sensed[0], sensed[2]), task.module.error(sensed[0], sensed[2]))
+
+
+def test_the_error_of_a_position_is_the_distance(simulate):
+    simulation = simulate("panda_reach")
+    q = inside_of_limits(simulation, 20)
+    position, _ = poses(simulation, q)
+    off = np.random.default_rng(1).normal(size=(20, 3))
+    error = simulation.task.error(state_at(q), position + off)
+    np.testing.assert_allclose(error[:, 0], np.linalg.norm(off, axis=1), rtol=1e-4)
+
+
+def test_the_errors_of_a_pose_are_distance_and_angle_whichever_sign_its_quaternion_has(simulate):
+    simulation = simulate("panda_pose")
+    q = inside_of_limits(simulation, 20)
+    position, rotation = poses(simulation, q)
+    turn = Rotation.random(20, random_state=0)
+    quaternion = (turn * Rotation.from_matrix(rotation)).as_quat()
+    for sign in (1, -1):
+        goal = np.concatenate([position + [0.0, 0.1, 0.0], sign * quaternion], axis=1)
+        error = simulation.task.error(state_at(q), goal)
+        np.testing.assert_allclose(error[:, 0], 0.1, rtol=1e-3)
+        np.testing.assert_allclose(error[:, 1], turn.magnitude(), atol=2e-3)
+        seen = [torch.from_numpy(array).float() for array in (q, np.zeros_like(q), goal)]
+        features = simulation.task.module(*seen)
+        if sign == 1:
+            first = features
+    assert all(torch.equal(*pair) for pair in zip(first, features, strict=True))
+
+
+@pytest.mark.parametrize("name", ["panda_reach", "panda_pose"])
+def test_what_is_said_to_shorten_the_errors_does(simulate, name):
+    """A step along Jᵀe, and for poses along J_ωᵀr, brings the end effector nearer."""
+    simulation = simulate(name)
+    task, n = simulation.task, len(simulation.spec.joints)
+    q, goal = inside_of_limits(simulation, 50), task.sample_goal(50, generator(1))
+    _, features = task.module(*(torch.from_numpy(array).float() for array in (q, np.zeros_like(q), goal)))
+    errors = features[:, 3 * n : 3 * n + len(task.module.coarse)] / task.module.coarse
+    before = task.error(state_at(q), goal)
+    for column, joints in enumerate(errors[:, 3 * len(before[0]) :].split(n, dim=1)):
+        step = joints.double().numpy()
+        step *= 1e-3 / np.linalg.norm(step, axis=1, keepdims=True)
+        assert (task.error(state_at(q + step), goal)[:, column] < before[:, column]).mean() > 0.95
+
+
+@pytest.mark.parametrize("name", SPACE)
+def test_goals_are_drawn_in_the_region_from_the_generator_alone(simulate, name):
+    task = simulate(name).task
+    goals = task.sample_goal(200, generator())
+    assert goals.shape == (200, *task.goal.shape)
+    assert all(map(task.region.contains, goals))
+    np.testing.assert_array_equal(goals, task.sample_goal(200, generator()))
+    assert len(np.unique(goals, axis=0)) == 200
+    low, high = (bound[:3] for bound in task.region.bounds)
+    assert (np.ptp(goals[:, :3], axis=0) > 0.8 * (high - low)).all()  # all over it
+
+
+def test_poses_are_drawn_that_the_arm_takes_also_far_from_home(simulate):
+    task = simulate("panda_pose").task
+    goals = task.sample_goal(500, generator())
+    np.testing.assert_allclose(np.linalg.norm(goals[:, 3:], axis=1), 1.0, atol=1e-6)
+    home = poses(simulate("panda_pose"), simulate("panda_pose").spec.home[None])[1]
+    away = (Rotation.from_quat(goals[:, 3:]) * Rotation.from_matrix(home).inv()).magnitude()
+    assert np.quantile(away, 0.9) > 2.0  # rad
+
+
+def test_a_policy_file_names_examples_of_goals_that_the_arm_reaches(simulate):
+    region = simulate("panda_pose").task.region
+    assert (region.kind, len(region.examples) % 7, region.sample(3, generator()).shape) == ("reachable", 0, (3, 7))
+
+
+def test_success_that_ends_nothing_pays_in_each_step_of_it(simulate):
+    simulation = simulate("panda_reach")
+    simulation.reset()
+    position, _ = poses(simulation, simulation.state.joint_position)
+    simulation.goal = position.copy()
+    for _ in range(3):
+        reward, terminated, truncated = simulation.step(np.zeros((8, 7)))
+        assert simulation.success.all()
+        assert not (terminated | truncated).any()
+    paid = simulation.episode_rewards[:, simulation.reward_terms.index("success")]
+    np.testing.assert_allclose(paid, 3 * 0.2, rtol=1e-6)
+
+
+def test_a_posture_away_from_home_costs_by_the_joint_s_range(simulate):
+    simulation = simulate("panda_reach")
+    simulation.reset()
+    simulation.step(np.zeros((8, 7)))
+    away = (simulation.state.joint_position - simulation.spec.home) / (np.ptp(simulation.spec.position_limit, axis=1) / 2)
+    paid = simulation.episode_rewards[:, simulation.reward_terms.index("posture")]
+    np.testing.assert_allclose(paid, -0.3 * (away**2).mean(axis=1), rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "line"),
+    [
+        (["panda_reach", "env.task.region.high=[1.5,0.4,0.7]"], r"reaches 1\.\d\d m"),
+        (["panda_reach", "env.task.region.high=[0.1,0.4,0.7]"], "a box needs lower and upper bounds"),
+        (["panda_reach", "env.task.region.low=[0.3,0.1]", "env.task.region.high=[0.5,0.2]"], "Ball of three numbers"),
+        (["panda_pose", "env.task.region.low=[3,3,3]", "env.task.region.high=[4,4,4]"], "only 0 lead into the box"),
+    ],
+)
+def test_regions_that_make_no_sense_are_one_line(env_config, overrides, line):
+    name, *rest = overrides
+    with pytest.raises(UserError, match=line):
+        Simulation(env_config(name, "physics=mujoco", *rest), 1, seed=0)
+
+
+def test_a_ball_is_a_region_too(simulate):
+    ball = "{_target_: physai.signals.Ball, center: [0.5, 0.0, 0.4], radius: 0.2}"
+    task = simulate("panda_reach", "~env.task.region", f"+env.task.region={ball}").task
+    goals = task.sample_goal(500, generator())
+    assert task.goal.quantity is Quantity.POSITION
+    assert (np.linalg.norm(goals - [0.5, 0.0, 0.4], axis=1) <= 0.2).all()
