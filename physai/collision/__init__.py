@@ -1,4 +1,4 @@
-"""Whether a robot touches itself or what stands around it: capsules, their distances, and a form that files can hold."""
+"""Whether a robot touches itself or what stands around it: capsules, their distances, and their form in files."""
 
 from physai.collision.capsules import Box, Capsule
 from physai.collision.frames import Motions
