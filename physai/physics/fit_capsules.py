@@ -8,7 +8,7 @@ import numpy as np
 
 from physai.physics.shapes import ShapeCollisions
 from physai.robots import RobotSpec, urdf
-from physai.robots.capsules import Fitted, Piece, cut_once
+from physai.robots.capsules import Fitted, Piece, cut_more
 from physai.robots.collision import CapsuleConfig, CollisionConfig, model
 from physai.robots.shapes import collision_parts
 
@@ -106,7 +106,7 @@ class CapsuleFit:
 
     def _cut(self, link: str, count: int) -> list[Piece]:
         if (link, count) not in self._pieces:
-            self._pieces[link, count] = cut_once(self._cut(link, count - 1))
+            self._pieces[link, count] = cut_more(self._cut(link, 1)[0], self._cut(link, count - 1))
         return self._pieces[link, count]
 
     def _distance(self, config: CollisionConfig) -> np.ndarray:

@@ -1,6 +1,5 @@
 """Fitting capsules: the smallest that holds a set of points, and a few that hold the convex parts of a link."""
 
-import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -8,8 +7,8 @@ import numpy as np
 from scipy.optimize import minimize
 from scipy.spatial import ConvexHull, QhullError
 
-_CUTS = np.linspace(0.2, 0.8, 7)  # where a piece may be cut, as shares of its length
-_TICKS = 16  # points along each edge of the grid by which space is measured
+_SLICES = [(place, place) for place in np.linspace(0.2, 0.8, 7)]  # where a piece is cut in two, shares of its length
+_TICKS = 20  # points along each edge of the grid by which space is measured
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,39 +81,85 @@ class Piece:
         """Fit the smallest capsule."""
         return cls(list(parts), smallest_capsule(np.concatenate(parts)))
 
-    @functools.cached_property
-    def saving(self) -> float:
-        """How much less space its halves take, m³."""
-        return self._cut[0]
+    def slices(self, count: int) -> list["Piece"]:
+        """Cut it in slices that take least space, as far as rough capsules tell.
 
-    def halves(self) -> list["Piece"]:
-        """Cut it where its halves take least space. Parts are cut with it.
-
-        A capsule is convex, so it holds all of a half whose corners it holds.
+        Parts are cut with it: a capsule is convex, so it holds all of a slice whose corners it holds.
         """
-        return [Piece.of(parts) for parts in self._cut[1]]
-
-    @functools.cached_property
-    def _cut(self) -> tuple[float, list[list[np.ndarray]]]:
         points = np.concatenate(self.parts)
-        low, high = points.min(axis=0), points.max(axis=0)
-        size = (high - low).max()
-        ticks = [
-            np.linspace(begin - 0.3 * size, end + 0.3 * size, _TICKS) for begin, end in zip(low, high, strict=True)
-        ]
-        grid = np.stack(np.meshgrid(*ticks), axis=-1).reshape(-1, 3)
-        cell = float(np.prod([tick[1] - tick[0] for tick in ticks]))
-        best, cut = np.inf, [self.parts]
+        space = Space(points)
+        tried = []
         for normal in [*_axes(points), _direction(self.fitted)]:
             height = points @ normal
-            for place in height.min() + _CUTS * np.ptp(height):
-                sides = zip(*(_cut(part, normal, place) for part in self.parts), strict=True)
-                halves = [[half for half in side if len(half)] for side in sides]
-                rough = [_roughly(np.concatenate(half)) for half in halves]
-                space = np.logical_or(*(each.outside(grid) <= 0 for each in rough)).sum() * cell
-                if space < best:
-                    best, cut = space, halves
-        return float((self.fitted.outside(grid) <= 0).sum() * cell - best), cut
+            for first, last in _SLICES if count == 2 else [(1.0 / count, 1.0 - 1.0 / count)]:
+                places = height.min() + np.ptp(height) * np.linspace(first, last, count - 1)
+                slices = _slices(self.parts, normal, places)
+                rough = [_roughly(np.concatenate(part)) for part in slices]
+                tried.append((space.taken(rough), len(tried), slices))
+        return [Piece.of(parts) for parts in min(tried)[2]]
+
+
+class Space:
+    """Measures how much space capsules around points [V, 3] take together, m³, by a grid."""
+
+    def __init__(self, points: np.ndarray) -> None:
+        low, high = points.min(axis=0), points.max(axis=0)
+        more = 0.3 * (high - low).max()
+        ticks = [np.linspace(*ends, _TICKS) for ends in zip(low - more, high + more, strict=True)]
+        self._grid = np.stack(np.meshgrid(*ticks), axis=-1).reshape(-1, 3)
+        self._cell = float(np.prod([tick[1] - tick[0] for tick in ticks]))
+
+    def taken(self, capsules: Sequence[Fitted]) -> float:
+        """Count the cells within any of them."""
+        return float(np.any([each.outside(self._grid) <= 0 for each in capsules], axis=0).sum()) * self._cell
+
+
+def cut_more(whole: Piece, pieces: Sequence[Piece]) -> list[Piece]:
+    """Cut a link into one more piece: one of those that there are in two, or the whole link in slices.
+
+    Args:
+        whole: The link in one piece.
+        pieces: What it is cut into.
+
+    Returns:
+        Those whose capsules take least space.
+    """
+    tried = [[*pieces[:row], *piece.slices(2), *pieces[row + 1 :]] for row, piece in enumerate(pieces)]
+    if len(pieces) > 1:
+        tried.append(whole.slices(len(pieces) + 1))
+    space = Space(np.concatenate(whole.parts))
+    return min(tried, key=lambda each: space.taken([piece.fitted for piece in each]))
+
+
+def _slices(parts: Sequence[np.ndarray], normal: np.ndarray, places: np.ndarray) -> list[list[np.ndarray]]:
+    slices, rest = [], list(parts)
+    for place in places:
+        below, rest = (
+            [side for side in sides if len(side)]
+            for sides in zip(*(_cut(part, normal, place) for part in rest), strict=True)
+        )
+        slices.append(below)
+    return [each for each in [*slices, rest] if each]
+
+
+def _cut(self) -> tuple[float, list[list[np.ndarray]]]:
+    points = np.concatenate(self.parts)
+    low, high = points.min(axis=0), points.max(axis=0)
+    size = (high - low).max()
+    ticks = [np.linspace(begin - 0.3 * size, end + 0.3 * size, _TICKS) for begin, end in zip(low, high, strict=True)]
+    grid = np.stack(np.meshgrid(*ticks), axis=-1).reshape(-1, 3)
+    cell = float(np.prod([tick[1] - tick[0] for tick in ticks]))
+    best, cut = np.inf, [self.parts]
+    for normal in [*_axes(points), _direction(self.fitted)]:
+        height = points @ normal
+        for place in height.min() + _CUTS * np.ptp(height):
+            sides = zip(*(_cut(part, normal, place) for part in self.parts), strict=True)
+            halves = [[half for half in side if len(half)] for side in sides]
+            rough = [_roughly(np.concatenate(half)) for half in halves]
+            space = np.logical_or(*(each.outside(grid) <= 0 for each in rough)).sum() * cell
+            if space < best:
+                best, cut = space, halves
+    return float((self.fitted.outside(grid) <= 0).sum() * cell - best), cut
 
 
 def cut_once(pieces: Sequence[Piece]) -> list[Piece]:
