@@ -8,11 +8,14 @@ import numpy as np
 
 from physai.physics.shapes import ShapeCollisions
 from physai.robots import RobotSpec, urdf
-from physai.robots.capsules import Fitted, Piece, cut_more
+from physai.robots.capsules import Fitted, Piece, cut_one
 from physai.robots.collision import CapsuleConfig, CollisionConfig, model
 from physai.robots.shapes import collision_parts
 
 _DIGITS = 4  # of metres, to which capsules are written
+_FEW = 4000  # of the random configurations, by which capsules are chosen
+_PAIR = 0.001  # the share of false alarms for which one more pair is worth its time
+_PATIENCE = 3  # cuts in a row that are no better, after which no more are tried
 
 
 @dataclass(frozen=True)
@@ -67,7 +70,8 @@ class CapsuleFit:
             judge.close()
         self._touching = (distance <= 0).any(axis=1)
         self._pairs = [pair for pair, least in zip(judge.names, distance.min(axis=0), strict=True) if least < near]
-        self._pieces = {(link, 1): [Piece.of(parts)] for link, parts in self.parts.items()}
+        self._whole = {link: Piece.of(parts) for link, parts in self.parts.items()}
+        self._sliced: dict[tuple[str, int], list[list[Piece]]] = {}
 
     def fit(self, false_alarms: float, most: int) -> tuple[CollisionConfig, Judged]:
         """Fit.
@@ -79,51 +83,76 @@ class CapsuleFit:
         Returns:
             What a robot's YAML holds, and how it compares with the shapes in the configurations that it is made by.
         """
-        made = self._made(dict.fromkeys(self.parts, 1))
-        while made.judged.false_alarms > false_alarms and sum(made.counts.values()) < most:
-            tried = [self._made(made.counts | {link: made.counts[link] + 1}) for link in made.worst]
-            made = min(tried, key=lambda one: one.depth)
-        return made.config, made.judged
+        few = slice(_FEW)
+        best = made = self._made({link: [whole] for link, whole in self._whole.items()}, few)
+        in_vain = 0
+        while best.judged.false_alarms > false_alarms and made.count < most and in_vain < _PATIENCE:
+            made = self._refined(made, few)
+            better = made.cost < best.cost
+            best, in_vain = (made, 0) if better else (best, in_vain + 1)
+        whole = self._made(best.pieces, slice(None))
+        return whole.config, whole.judged
 
-    def _made(self, counts: Mapping[str, int]) -> "_Made":
-        capsules = [
-            _capsule(link, each.fitted, self._skin) for link in counts for each in self._cut(link, counts[link])
-        ]
-        places: dict[str, list[int]] = {link: [] for link in counts}
+    def _refined(self, made: "_Made", rows: slice) -> "_Made":
+        """Cut one of the two worst links, or both, into one more piece."""
+        pieces, links = made.pieces, made.worst
+        singles = []
+        for link in links:
+            tried = [self._made(pieces | {link: more}, rows) for more in self._more(link, pieces[link])]
+            singles.append(min(tried, key=lambda one: one.depth))
+        both = pieces | {link: single.pieces[link] for link, single in zip(links, singles, strict=True)}
+        return min([*singles, self._made(both, rows)], key=lambda one: one.depth)
+
+    def _more(self, link: str, pieces: list[Piece]) -> list[list[Piece]]:
+        """Ways to cut a link into one more piece."""
+        count = len(pieces) + 1
+        if (link, count) not in self._sliced:
+            self._sliced[link, count] = self._whole[link].slices(count)
+        return [cut_one(self._whole[link], pieces), *self._sliced[link, count]]
+
+    def _made(self, pieces: Mapping[str, list[Piece]], rows: slice) -> "_Made":
+        capsules = [_capsule(link, each.fitted, self._skin) for link in pieces for each in pieces[link]]
+        places: dict[str, list[int]] = {link: [] for link in pieces}
         for place, capsule in enumerate(capsules):
             places[capsule.link].append(place)
         pairs = [[a, b] for first, second in self._pairs for a in places[first] for b in places[second]]
-        distance = self._distance(CollisionConfig(capsules=capsules, pairs=pairs))
+        distance = self._distance(CollisionConfig(capsules=capsules, pairs=pairs), rows)
         kept = np.flatnonzero(distance.min(axis=0) < self._near)
         config = CollisionConfig(capsules=capsules, pairs=[pairs[place] for place in kept])
-        distance = distance[:, kept]
-        free = distance[~self._touching]
-        deepest = distance.argmin(axis=1)[~self._touching & (distance.min(axis=1) <= 0)]
-        worst = config.pairs[np.bincount(deepest, minlength=1).argmax()]
-        judged = Judged.of((distance <= 0).any(axis=1), self._touching)
-        depth = float(np.maximum(-free.min(axis=1), 0.0).mean())
-        return _Made(dict(counts), config, judged, depth, [capsules[place].link for place in worst])
+        distance, touching = distance[:, kept], self._touching[rows]
+        nearest = distance.min(axis=1)
+        judged = Judged.of(nearest <= 0, touching)
+        wrong = ~touching & (nearest <= 0)
+        worst = [[capsules[place].link for place in pair] for pair in config.pairs]
+        most = np.bincount(distance.argmin(axis=1)[wrong], minlength=1).argmax()
+        depth = float(-np.where(wrong, nearest, 0.0).mean())
+        return _Made(dict(pieces), config, judged, depth, worst[most] if worst else [])
 
-    def _cut(self, link: str, count: int) -> list[Piece]:
-        if (link, count) not in self._pieces:
-            self._pieces[link, count] = cut_more(self._cut(link, 1)[0], self._cut(link, count - 1))
-        return self._pieces[link, count]
-
-    def _distance(self, config: CollisionConfig) -> np.ndarray:
+    def _distance(self, config: CollisionConfig, rows: slice) -> np.ndarray:
         spec = self._spec
         made = model(spec.urdf, self._robot, spec.chain, spec.joints, config)
-        return made.distance(self._joint_position)
+        return made.distance(self._joint_position[rows])
 
 
 @dataclass(frozen=True)
 class _Made:
     """Capsules so far; ``depth`` is how deep they overlap where shapes do not touch, m, and ``worst`` links do most."""
 
-    counts: dict[str, int]
+    pieces: dict[str, list[Piece]]
     config: CollisionConfig
     judged: Judged
     depth: float
     worst: list[str]
+
+    @property
+    def cost(self) -> float:
+        """False alarms, and the time that pairs take."""
+        return self.judged.false_alarms + _PAIR * len(self.config.pairs)
+
+    @property
+    def count(self) -> int:
+        """How many capsules."""
+        return len(self.config.capsules)
 
 
 def _capsule(link: str, fitted: Fitted, skin: float) -> CapsuleConfig:

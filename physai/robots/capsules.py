@@ -7,7 +7,7 @@ import numpy as np
 from scipy.optimize import minimize
 from scipy.spatial import ConvexHull, QhullError
 
-_SLICES = [(place, place) for place in np.linspace(0.2, 0.8, 7)]  # where a piece is cut in two, shares of its length
+_CUTS = np.linspace(0.2, 0.8, 7)  # where a piece may be cut in two, as shares of its length
 _TICKS = 20  # points along each edge of the grid by which space is measured
 
 
@@ -81,22 +81,23 @@ class Piece:
         """Fit the smallest capsule."""
         return cls(list(parts), smallest_capsule(np.concatenate(parts)))
 
-    def slices(self, count: int) -> list["Piece"]:
-        """Cut it in slices that take least space, as far as rough capsules tell.
-
-        Parts are cut with it: a capsule is convex, so it holds all of a slice whose corners it holds.
-        """
+    def halves(self) -> list["Piece"]:
+        """Cut it in two where the halves take least space, as far as rough capsules tell."""
         points = np.concatenate(self.parts)
         space = Space(points)
         tried = []
-        for normal in [*_axes(points), _direction(self.fitted)]:
-            height = points @ normal
-            for first, last in _SLICES if count == 2 else [(1.0 / count, 1.0 - 1.0 / count)]:
-                places = height.min() + np.ptp(height) * np.linspace(first, last, count - 1)
-                slices = _slices(self.parts, normal, places)
+        for normal in _normals(points, self.fitted):
+            for place in _CUTS:
+                slices = _slices(self.parts, normal, np.array([place]))
                 rough = [_roughly(np.concatenate(part)) for part in slices]
                 tried.append((space.taken(rough), len(tried), slices))
         return [Piece.of(parts) for parts in min(tried)[2]]
+
+    def slices(self, count: int) -> list[list["Piece"]]:
+        """Cut it in slices as thick as each other, in each of some directions."""
+        normals = _normals(np.concatenate(self.parts), self.fitted)
+        places = np.arange(1, count) / count
+        return [[Piece.of(parts) for parts in _slices(self.parts, normal, places)] for normal in normals]
 
 
 class Space:
@@ -114,32 +115,30 @@ class Space:
         return float(np.any([each.outside(self._grid) <= 0 for each in capsules], axis=0).sum()) * self._cell
 
 
-def cut_more(whole: Piece, pieces: Sequence[Piece]) -> list[Piece]:
-    """Cut a link into one more piece: one of those that there are in two, or the whole link in slices.
-
-    Args:
-        whole: The link in one piece.
-        pieces: What it is cut into.
-
-    Returns:
-        Those whose capsules take least space.
-    """
-    tried = [[*pieces[:row], *piece.slices(2), *pieces[row + 1 :]] for row, piece in enumerate(pieces)]
-    if len(pieces) > 1:
-        tried.append(whole.slices(len(pieces) + 1))
+def cut_one(whole: Piece, pieces: Sequence[Piece]) -> list[Piece]:
+    """Cut that one of the pieces of a link in two that makes its capsules take least space together."""
+    tried = [[*pieces[:row], *piece.halves(), *pieces[row + 1 :]] for row, piece in enumerate(pieces)]
     space = Space(np.concatenate(whole.parts))
     return min(tried, key=lambda each: space.taken([piece.fitted for piece in each]))
 
 
 def _slices(parts: Sequence[np.ndarray], normal: np.ndarray, places: np.ndarray) -> list[list[np.ndarray]]:
+    """Cut convex parts by planes at ``places``, which are shares of their length along ``normal``.
+
+    Parts are cut with their corners. A capsule is convex, so it holds all of a slice whose corners it holds.
+    """
+    height = np.concatenate(parts) @ normal
     slices, rest = [], list(parts)
-    for place in places:
-        below, rest = (
-            [side for side in sides if len(side)]
-            for sides in zip(*(_cut(part, normal, place) for part in rest), strict=True)
-        )
-        slices.append(below)
+    for place in height.min() + places * np.ptp(height):
+        cut = [_cut(part, normal, place) for part in rest]
+        slices.append([below for below, _ in cut if len(below)])
+        rest = [above for _, above in cut if len(above)]
     return [each for each in [*slices, rest] if each]
+
+
+def _normals(points: np.ndarray, fitted: Fitted) -> list[np.ndarray]:
+    """Directions across which it may be good to cut."""
+    return [*_axes(points), _direction(fitted)]
 
 
 def _cut(self) -> tuple[float, list[list[np.ndarray]]]:
