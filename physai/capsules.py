@@ -81,7 +81,7 @@ def as_yaml(found: CollisionConfig, robot: str) -> str:
     lines.append("pairs:" if found.pairs else "pairs: []")
     for pair in found.pairs:
         first, second = (found.capsules[place].link for place in pair)
-        lines.append(f"  - {pair}    # {first}, {second}")
+        lines.append(f"  - {pair!s:<12}# {first}, {second}")
     return "\n".join(lines) + "\n"
 
 

@@ -45,7 +45,8 @@ class CapsuleFit:
 
     Pairs are chosen as MoveIt's set-up assistant makes its allowed collision matrix: by random configurations. Links
     that a joint joins, that touch always, or that never come near each other are left out. Each link begins with one
-    capsule; then again and again that link gets one more for which most false alarms go.
+    capsule. Then again and again one of the two links that alarm falsely most often, or both, are cut into one more
+    piece, each with its capsule, in the way for which their capsules overlap least where the shapes do not touch.
 
     Args:
         spec: The robot.
@@ -120,13 +121,12 @@ class CapsuleFit:
         kept = np.flatnonzero(distance.min(axis=0) < self._near)
         config = CollisionConfig(capsules=capsules, pairs=[pairs[place] for place in kept])
         distance, touching = distance[:, kept], self._touching[rows]
-        nearest = distance.min(axis=1)
+        nearest = distance.min(axis=1, initial=np.inf)
         judged = Judged.of(nearest <= 0, touching)
         wrong = ~touching & (nearest <= 0)
-        worst = [[capsules[place].link for place in pair] for pair in config.pairs]
-        most = np.bincount(distance.argmin(axis=1)[wrong], minlength=1).argmax()
+        worst = config.pairs[np.bincount(distance[wrong].argmin(axis=1)).argmax()] if wrong.any() else []
         depth = float(-np.where(wrong, nearest, 0.0).mean())
-        return _Made(dict(pieces), config, judged, depth, worst[most] if worst else [])
+        return _Made(dict(pieces), config, judged, depth, [capsules[place].link for place in worst])
 
     def _distance(self, config: CollisionConfig, rows: slice) -> np.ndarray:
         spec = self._spec
@@ -156,7 +156,7 @@ class _Made:
 
 
 def _capsule(link: str, fitted: Fitted, skin: float) -> CapsuleConfig:
-    start, end = (np.round(point, _DIGITS).tolist() for point in (fitted.start, fitted.end))
+    start, end = ((np.round(point, _DIGITS) + 0.0).tolist() for point in (fitted.start, fitted.end))
     unit = 10.0**-_DIGITS
     radius = (math.ceil((fitted.radius + skin) / unit) + 1) * unit  # one more: the ends are rounded
     return CapsuleConfig(link=link, start=start, end=end, radius=round(radius, _DIGITS))
