@@ -59,9 +59,10 @@ def _fit(node: DictConfig, _: Path) -> None:
     config.picture.parent.mkdir(parents=True, exist_ok=True)
     plot_capsules(fitted, fit.parts, config.picture)
     print(
-        f"{len(found.capsules)} capsules, {len(found.pairs)} pairs that can meet. Shapes touch in {judged.touching:.1%} of "
-        f"the configurations: capsules miss {judged.missed:.2%} of these and alarm falsely in {judged.false_alarms:.1%} of "
-        f"the others.\nWritten: {config.path}; drawn: {config.picture}"
+        f"{len(found.capsules)} capsules, {len(found.pairs)} pairs of them can meet.\n"
+        f"Shapes touch in {judged.touching:.1%} of the configurations: capsules miss {judged.missed:.2%} of these, and "
+        f"alarm falsely in {judged.false_alarms:.1%} of the others.\n"
+        f"Written: {config.path}; drawn: {config.picture}"
     )
     if config.robot.collision is None:
         print(f"To use them, add to the defaults of the robot's YAML: collision: {config.path.stem}")
@@ -70,8 +71,8 @@ def _fit(node: DictConfig, _: Path) -> None:
 def as_yaml(found: CollisionConfig, robot: str) -> str:
     """Write capsules as a file of ``conf/robot/collision``."""
     lines = [
-        f"# Written by: python -m physai.capsules robot={robot}. Ends in the frames of the links, m; pairs are of places in",
-        "# the list of capsules, from 0 on.",
+        f"# Written by: python -m physai.capsules robot={robot}",
+        "# Ends in the frames of the links, m; pairs are of places in the list of capsules, from 0 on.",
         "capsules:",
     ]
     for capsule in found.capsules:

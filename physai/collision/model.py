@@ -77,8 +77,8 @@ class CollisionModel:
             joint_position: rad, [N, n].
 
         Returns:
-            Between surfaces, m, negative where they overlap, [N, P]; ``names`` says between what. Of a robot with a joint
-            position that is not finite some are NaN, which is not below zero either: ask for finite ones first.
+            Between surfaces, m, negative where they overlap, [N, P]; ``names`` says between what. Of a joint position
+            that is not finite they may be NaN, which is not below zero either: ask for finite ones first.
         """
         distance = np.empty((len(joint_position), len(self.names)))
         block = max(8, _BLOCK // max(len(self.pairs) + _BOXES * (len(self.names) - len(self.pairs)), 16))

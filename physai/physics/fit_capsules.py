@@ -69,7 +69,7 @@ class CapsuleFit:
             distance = judge.distance(self._joint_position, within=near)
         finally:
             judge.close()
-        self._touching = (distance <= 0).any(axis=1)
+        self._touching: np.ndarray = np.any(distance <= 0, axis=1)
         self._pairs = [pair for pair, least in zip(judge.names, distance.min(axis=0), strict=True) if least < near]
         self._whole = {link: Piece.of(parts) for link, parts in self.parts.items()}
         self._sliced: dict[tuple[str, int], list[list[Piece]]] = {}

@@ -29,7 +29,7 @@ class ShapeCollisions:
     def __init__(self, spec: RobotSpec, floor: float | None = None, boxes: Iterable[Box] = ()) -> None:
         self._client = bullet.connect(bullet.DIRECT)
         self._body = bullet.loadURDF(str(spec.urdf), useFixedBase=True, physicsClientId=self._client)
-        # The base frame is that of the base's inertia: let it be the URDF's.
+        # What PyBullet places is the base's centre of mass; what is meant is the frame of its link.
         dynamics = bullet.getDynamicsInfo(self._body, -1, self._client)
         bullet.resetBasePositionAndOrientation(self._body, dynamics[3], dynamics[4], self._client)
         infos = [
@@ -83,7 +83,7 @@ class ShapeCollisions:
 
     def touching(self, joint_position: np.ndarray) -> np.ndarray:
         """Whether anything touches at joint positions [N, n], rad, [N]."""
-        return (self.distance(joint_position, within=0.0) <= 0).any(axis=1)
+        return np.any(self.distance(joint_position, within=0.0) <= 0, axis=1)
 
     def links(self, joint_position: np.ndarray) -> list[tuple[str, str]]:
         """Which pairs touch at joint positions [n], rad."""

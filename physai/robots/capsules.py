@@ -85,7 +85,7 @@ class Piece:
         """Cut it in two where the halves take least space, as far as rough capsules tell."""
         points = np.concatenate(self.parts)
         space = Space(points)
-        tried = []
+        tried: list[tuple[float, int, list[list[np.ndarray]]]] = []
         for normal in _normals(points, self.fitted):
             for place in _CUTS:
                 slices = _slices(self.parts, normal, np.array([place]))
@@ -141,32 +141,6 @@ def _normals(points: np.ndarray, fitted: Fitted) -> list[np.ndarray]:
     return [*_axes(points), _direction(fitted)]
 
 
-def _cut(self) -> tuple[float, list[list[np.ndarray]]]:
-    points = np.concatenate(self.parts)
-    low, high = points.min(axis=0), points.max(axis=0)
-    size = (high - low).max()
-    ticks = [np.linspace(begin - 0.3 * size, end + 0.3 * size, _TICKS) for begin, end in zip(low, high, strict=True)]
-    grid = np.stack(np.meshgrid(*ticks), axis=-1).reshape(-1, 3)
-    cell = float(np.prod([tick[1] - tick[0] for tick in ticks]))
-    best, cut = np.inf, [self.parts]
-    for normal in [*_axes(points), _direction(self.fitted)]:
-        height = points @ normal
-        for place in height.min() + _CUTS * np.ptp(height):
-            sides = zip(*(_cut(part, normal, place) for part in self.parts), strict=True)
-            halves = [[half for half in side if len(half)] for side in sides]
-            rough = [_roughly(np.concatenate(half)) for half in halves]
-            space = np.logical_or(*(each.outside(grid) <= 0 for each in rough)).sum() * cell
-            if space < best:
-                best, cut = space, halves
-    return float((self.fitted.outside(grid) <= 0).sum() * cell - best), cut
-
-
-def cut_once(pieces: Sequence[Piece]) -> list[Piece]:
-    """Cut the piece of a link whose halves save most space."""
-    best = int(np.argmax([piece.saving for piece in pieces]))
-    return [*pieces[:best], *pieces[best].halves(), *pieces[best + 1 :]]
-
-
 def _cut(points: np.ndarray, normal: np.ndarray, place: float) -> tuple[np.ndarray, np.ndarray]:
     """Cut the convex hull of points in two; return the corners below and above, none where nothing is."""
     height = points @ normal - place
@@ -200,7 +174,7 @@ def _roughly(points: np.ndarray) -> Fitted:
 
 def _axes(points: np.ndarray) -> np.ndarray:
     """Return the main axes of points, and those of their frame, which designers like, [6, 3]."""
-    return np.concatenate([np.linalg.svd(points - points.mean(axis=0))[2], np.eye(3)])
+    return np.concatenate([np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2], np.eye(3)])
 
 
 def _circle_center(points: np.ndarray, axis: np.ndarray) -> np.ndarray:

@@ -84,7 +84,8 @@ def _mesh(path: Path, where: str, element: etree._Element) -> list[np.ndarray]:
     try:
         # Objects, not materials: these would be parts that are smaller together than the hull of the object.
         scene = trimesh.load_scene(file, process=False, split_objects=True, group_material=False, skip_materials=True)
-        parts = [np.asarray(mesh.vertices, dtype=np.float64) for mesh in scene.dump()]
+        meshes = [mesh for mesh in scene.dump() if isinstance(mesh, trimesh.Trimesh)]
+        parts = [np.asarray(mesh.vertices, dtype=np.float64) for mesh in meshes]
     except Exception as error:  # whatever a reader makes of a broken file
         raise UserError(f"{where}: {file}: not a mesh that can be read: {' '.join(str(error).split())}") from error
     if not parts or not all(len(part) and np.isfinite(part).all() for part in parts):
@@ -106,7 +107,7 @@ def _numbers(where: str, element: etree._Element, key: str, count: int, absent: 
         numbers = np.array(text.split(), dtype=np.float64)
     except ValueError:
         numbers = np.zeros(0)
-    mirrored = key == "scale"
+    mirrored = key == "scale"  # which may be negative
     if (
         numbers.shape != (count,)
         or not np.isfinite(numbers).all()

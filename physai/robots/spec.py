@@ -160,6 +160,9 @@ class RobotSpec:
                 )
 
         driven = tuple(config.joints)
+        shapes = None
+        if config.collision is not None:
+            shapes = collision.model(path, robot, chain, driven, config.collision)
         below = _links_below(config.joints[0], robot.joints, by_name)
         together = bodies.merge(path, robot, driven, config.end_effector, config.inertials)
         moving = [body for body in together if body.name in below and body.mass]
@@ -185,7 +188,7 @@ class RobotSpec:
             bodies=together,
             moving_links=tuple(body.name for body in moving),
             link_mass=np.array([body.mass for body in moving], dtype=np.float64),
-            collision=config.collision and collision.model(path, robot, chain, config.joints, config.collision),
+            collision=shapes,
             doubtful=_doubtful(robot, below, config),
         )
 
