@@ -193,7 +193,7 @@ def _on_line(points: np.ndarray, foot: np.ndarray, axis: np.ndarray, wider: floa
     along = way @ axis
     beside = np.einsum("ij,ij->i", way, way) - along * along
     radius = max(1.0, wider) * float(np.sqrt(max(beside.max(), 0.0))) + 1e-9
-    rise = np.sqrt(radius * radius - beside)
+    rise = np.sqrt(np.maximum(radius * radius - beside, 0.0))
     low, high = float((along + rise).min()), float((along - rise).max())
     if low > high:  # a sphere does
         low = high = 0.5 * (low + high)

@@ -1,6 +1,8 @@
 """Distances of a robot's capsules, and their way through a file."""
 
 import json
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -128,8 +130,5 @@ def test_what_no_model_can_be_is_refused_in_one_line(path, value, words):
 
 
 def test_it_needs_numpy_alone():
-    import subprocess
-    import sys
-
     code = "import sys, physai.collision; assert not {'torch', 'pydantic', 'scipy', 'pybullet'} & set(sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True)
