@@ -6,8 +6,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from physai.robots.chain import axis_of, motions
 from physai.robots.spec import RobotSpec
-from physai.robots.urdf import transform
 
 
 class ForwardKinematics(nn.Module):
@@ -28,28 +28,14 @@ class ForwardKinematics(nn.Module):
 
     def __init__(self, spec: RobotSpec) -> None:
         super().__init__()
-        constant, cosine, sine = (np.zeros((len(spec.joints), 8, 4)) for _ in range(3))
-        offsets: list[np.ndarray] = []
-        axes = np.zeros((len(spec.joints), 3))
-        fixed = np.eye(4)
-        for joint in spec.chain:
-            fixed = fixed @ transform(joint.origin)
-            if joint.name not in spec.joints:
-                continue
-            axis = np.array(joint.axis or [1.0, 0.0, 0.0])  # what a URDF means that names none
-            x, y, z = axis / np.linalg.norm(axis)
-            along = np.outer([x, y, z], [x, y, z])
-            across = np.eye(3) - along
-            cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-            row = len(offsets)
-            axes[row] = x, y, z
-            constant[row, :4] = fixed
-            constant[row, :3, :3] = fixed[:3, :3] @ along
-            cosine[row, :3, :3] = sine[row, 4:7, :3] = fixed[:3, :3] @ across
-            sine[row, :3, :3] = cosine[row, 4:7, :3] = fixed[:3, :3] @ cross
-            sine[row, 4:7] *= -1
-            offsets.append(fixed[:3, 3])
-            fixed = np.eye(4)
+        motion, fixed = motions(spec.chain, spec.joints)
+        offsets = motion.constant[:, :3, 3].copy()
+        constant, cosine, sine = np.zeros((3, len(motion), 8, 4))
+        constant[:, :4] = motion.constant
+        cosine[:, :4] = sine[:, 4:] = motion.cosine
+        sine[:, :4] = cosine[:, 4:] = motion.sine
+        sine[:, 4:] *= -1
+        axes = np.array([axis_of(joint) for joint in spec.chain if joint.name in spec.joints])
         for matrix in (constant, cosine, sine):
             matrix[-1] = matrix[-1] @ fixed  # the last link's frame moves to the tip
         axes[-1] = fixed[:3, :3].T @ axes[-1]

@@ -8,10 +8,12 @@ import numpy as np
 from pydantic import Field
 from urdf_parser_py.urdf import Joint, Robot
 
+from physai.collision import CollisionModel
 from physai.config import Config, NonNegativeFloat, PositiveFloat, nearest
 from physai.errors import UserError
-from physai.robots import bodies, urdf
+from physai.robots import bodies, collision, urdf
 from physai.robots.bodies import Body, InertialConfig
+from physai.robots.collision import CollisionConfig
 from physai.signals import Quantity, Signal
 
 
@@ -21,7 +23,7 @@ class RobotConfig(Config):
     ``command`` says what drives the joints, ``command_limit`` how fast an action of 1 moves each of them, rad/s, and
     ``position_gain`` how fast a joint that takes positions closes in on them, 1/s. What follows stands in the place of
     what the URDF says, or does not say: ``damping``, N·m·s/rad, and ``friction``, N·m, one value a joint, and
-    ``inertials`` of links by name.
+    ``inertials`` of links by name. Without ``collision`` nobody asks whether the robot touches itself.
     """
 
     name: str
@@ -35,6 +37,7 @@ class RobotConfig(Config):
     damping: list[NonNegativeFloat] | None
     friction: list[NonNegativeFloat] | None
     inertials: dict[str, InertialConfig]
+    collision: CollisionConfig | None
 
 
 @dataclass(frozen=True)
@@ -60,6 +63,7 @@ class RobotSpec:
         bodies: What engines simulate, from the base on.
         moving_links: Bodies with mass that the controlled joints move, by the name of their first link.
         link_mass: Their masses, kg.
+        collision: The shapes of its links and which of them can meet; None where nobody has told.
         doubtful: What its description says that can hardly be true, in words.
     """
 
@@ -81,12 +85,18 @@ class RobotSpec:
     bodies: tuple[Body, ...]
     moving_links: tuple[str, ...]
     link_mass: np.ndarray
+    collision: CollisionModel | None
     doubtful: tuple[str, ...]
 
     @property
     def continuous(self) -> np.ndarray:
         """Which joints turn without end, [n]."""
         return np.isinf(self.position_limit[:, 0])
+
+    def sample(self, rows: int, generator: np.random.Generator) -> np.ndarray:
+        """Draw joint positions [rows, n], rad, uniform within the limits; of a joint without any, a full turn."""
+        lower, upper = np.where(self.continuous[:, np.newaxis], [-np.pi, np.pi], self.position_limit).T
+        return generator.uniform(lower, upper, (rows, len(self.joints)))
 
     @property
     def joint_position(self) -> Signal:
@@ -150,6 +160,9 @@ class RobotSpec:
                 )
 
         driven = tuple(config.joints)
+        shapes = None
+        if config.collision is not None:
+            shapes = collision.model(path, robot, chain, driven, config.collision)
         below = _links_below(config.joints[0], robot.joints, by_name)
         together = bodies.merge(path, robot, driven, config.end_effector, config.inertials)
         moving = [body for body in together if body.name in below and body.mass]
@@ -175,6 +188,7 @@ class RobotSpec:
             bodies=together,
             moving_links=tuple(body.name for body in moving),
             link_mass=np.array([body.mass for body in moving], dtype=np.float64),
+            collision=shapes,
             doubtful=_doubtful(robot, below, config),
         )
 

@@ -159,9 +159,7 @@ def goals_in(
     return region
 
 
-def space_observation(
-    spec: RobotSpec, kinematics: ForwardKinematics, goal: tuple[np.ndarray, np.ndarray]
-) -> Signal:
+def space_observation(spec: RobotSpec, kinematics: ForwardKinematics, goal: tuple[np.ndarray, np.ndarray]) -> Signal:
     """Declare ``[q, qd, ee, goal]`` with bounds that have room, for joint limits are not walls.
 
     Args:
@@ -170,7 +168,10 @@ def space_observation(
         goal: Bounds of what is seen of a goal.
     """
     lower, upper = np.where(spec.continuous, [[-math.pi], [math.pi]], spec.position_limit.T)
-    velocity, end_effector = 2.0 * spec.velocity_limit, np.full(3, 1.01 * (kinematics.reach + np.linalg.norm(kinematics.shoulder)))
+    velocity, end_effector = (
+        2.0 * spec.velocity_limit,
+        np.full(3, 1.01 * (kinematics.reach + np.linalg.norm(kinematics.shoulder))),
+    )
     low = np.concatenate([lower - 0.5, -velocity, -end_effector, goal[0]])
     high = np.concatenate([upper + 0.5, velocity, end_effector, goal[1]])
     return Signal("observation", Quantity.VIEW, (len(low),), tuple(low.tolist()), tuple(high.tolist()))

@@ -13,6 +13,7 @@ from omegaconf import DictConfig, OmegaConf
 from ray.scripts.scripts import cli
 
 from physai.bench.__main__ import _options
+from physai.capsules import CapsulesConfig
 from physai.compose import compose
 from physai.config import validate
 from physai.envs.simulation import EnvConfig
@@ -38,6 +39,7 @@ COMMANDS = {
     "physai.evaluate": ("evaluate", EvaluateConfig),
     "physai.export": ("export", ExportConfig),
     "physai.play": ("play", PlayConfig),
+    "physai.capsules": ("capsules", CapsulesConfig),
     "physai.plot": ("plot", PlotConfig),
     "physai.ros.demo": ("demo", DemoConfig),
 }

@@ -18,7 +18,9 @@ from physai.robots.bodies import merge
 from physai.robots.urdf import load, transform
 from tests.physics.conftest import ENGINES
 
-LINK = '<link name="{name}"><inertial><origin xyz="{xyz}" rpy="{rpy}"/><mass value="{mass}"/>{inertia}</inertial></link>'
+LINK = (
+    '<link name="{name}"><inertial><origin xyz="{xyz}" rpy="{rpy}"/><mass value="{mass}"/>{inertia}</inertial></link>'
+)
 BOX = '<inertia ixx="{}" ixy="0" ixz="0" iyy="{}" iyz="0" izz="{}"/>'
 numbers = st.floats(-0.5, 0.5)
 triples = st.tuples(numbers, numbers, numbers)
@@ -118,7 +120,9 @@ def test_the_urdf_for_engines_places_every_body_where_the_robot_s_own_does(panda
 
 def test_an_inertia_that_no_body_can_have_names_its_link(tmp_path):
     path = two_links(tmp_path, second=(0.1, 0.1, 0.3))
-    with pytest.raises(UserError, match=r"link 'welded' moves but its inertia is none that a body can have.*'inertials'"):
+    with pytest.raises(
+        UserError, match=r"link 'welded' moves but its inertia is none that a body can have.*'inertials'"
+    ):
         merge(path, load(path), ("turns",), "tip", {})
 
 

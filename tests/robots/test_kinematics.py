@@ -146,6 +146,7 @@ def test_any_chain_of_turned_joints_matches_pybullet(tmp_path, seed):
         damping=None,
         friction=None,
         inertials={},
+        collision=None,
     )
     spec = RobotSpec.from_config(config)
     joint_position = random_positions(50, 3, seed)

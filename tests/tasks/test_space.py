@@ -150,7 +150,9 @@ def test_a_posture_away_from_home_costs_by_the_joint_s_range(simulate):
     simulation = simulate("panda_reach")
     simulation.reset()
     simulation.step(np.zeros((8, 7)))
-    away = (simulation.state.joint_position - simulation.spec.home) / (np.ptp(simulation.spec.position_limit, axis=1) / 2)
+    away = (simulation.state.joint_position - simulation.spec.home) / (
+        np.ptp(simulation.spec.position_limit, axis=1) / 2
+    )
     paid = simulation.episode_rewards[:, simulation.reward_terms.index("posture")]
     np.testing.assert_allclose(paid, -0.3 * (away**2).mean(axis=1), rtol=1e-5)
 

@@ -1,0 +1,71 @@
+"""What turns and what is carried along: the joints of a URDF as matrices."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from urdf_parser_py.urdf import Joint
+
+from physai.collision import Motions
+from physai.robots.urdf import transform
+
+
+def axis_of(joint: Joint) -> np.ndarray:
+    """The direction of its axis in the frame of the joint, [3]."""
+    axis = np.array(joint.axis or [1.0, 0.0, 0.0])  # what a URDF means that names none
+    direction: np.ndarray = axis / np.linalg.norm(axis)
+    return direction
+
+
+def motions(chain: Sequence[Joint], driven: Sequence[str]) -> tuple[Motions, np.ndarray]:
+    """Return what each driven joint of a chain does to the points of the link behind it.
+
+    Args:
+        chain: Joints from the base on; those that are not driven are held at zero.
+        driven: Names of the joints that move, in the order of the chain.
+
+    Returns:
+        The motions, and the fixed transform from the last driven joint's link to the end of the chain, 4 x 4.
+    """
+    constant, cosine, sine = np.zeros((3, len(driven), 4, 4))
+    fixed = np.eye(4)
+    row = 0
+    for joint in chain:
+        fixed = fixed @ transform(joint.origin)
+        if joint.name not in driven:
+            continue
+        x, y, z = axis_of(joint)
+        along = np.outer([x, y, z], [x, y, z])
+        across = np.eye(3) - along
+        cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+        constant[row] = fixed
+        constant[row, :3, :3] = fixed[:3, :3] @ along
+        cosine[row, :3, :3] = fixed[:3, :3] @ across
+        sine[row, :3, :3] = fixed[:3, :3] @ cross
+        fixed, row = np.eye(4), row + 1
+    return Motions(constant, cosine, sine), fixed
+
+
+def carried(joints: Sequence[Joint], base: str, driven: Sequence[str]) -> dict[str, tuple[int, np.ndarray]]:
+    """Return what carries each link.
+
+    Args:
+        joints: Of the whole robot; those that are not driven are held at zero.
+        base: The first link.
+        driven: Names of the joints that move, in order.
+
+    Returns:
+        By link, the index of the body (0 the base, k what the k-th driven joint moves) and the link's frame in that
+        body's, 4 x 4.
+    """
+    found = {base: (0, np.eye(4))}
+    links = [base]
+    for parent in links:  # grows while it is walked
+        body, frame = found[parent]
+        for joint in joints:
+            if joint.parent != parent:
+                continue
+            turns = joint.name in driven
+            here = (driven.index(joint.name) + 1, np.eye(4)) if turns else (body, frame @ transform(joint.origin))
+            found[joint.child] = here
+            links.append(joint.child)
+    return found
