@@ -26,6 +26,7 @@ _PARTS: dict[str, tuple[str, ...]] = {
     # Public classes of these packages and modules, of which nothing else can be reached by a name; those of libraries
     # only if they inherit from one of these. No constructor among them reads a file or imports what an argument names.
     "physai.algorithms": (),
+    "physai.collision": (),
     "physai.physics": (),  # not physai.ros: nobody trains there, and nobody's config may move a robot
     "physai.policies": (),
     "physai.signals": (),

@@ -13,6 +13,7 @@ from torch import Tensor
 import physai
 from physai.artifact.module import DeployablePolicy
 from physai.artifact.states import States
+from physai.collision import CollisionModel
 from physai.deploy.metadata import FORMAT, FORMAT_VERSION, describe_region, describe_signal
 from physai.envs.simulation import Simulation
 
@@ -41,7 +42,13 @@ def describe_robot(simulation: Simulation, policy: DeployablePolicy) -> dict[str
             "region": describe_region(task.region),
             "tolerances": [vars(tolerance) for tolerance in task.tolerances],
         },
+        "collision": None if (model := capsules(simulation)) is None else model.describe(),
     }
+
+
+def capsules(simulation: Simulation) -> CollisionModel | None:
+    """Return the robot's capsules, with what it was trained not to touch; None where it has none."""
+    return simulation.task.surroundings or simulation.spec.collision
 
 
 def describe_origin(git_commit: str | None) -> dict[str, Any]:

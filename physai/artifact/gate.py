@@ -17,9 +17,10 @@ from torch import Tensor
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from physai.artifact import fresh_process
+from physai.artifact.describe import capsules
 from physai.artifact.module import VIEWS, DeployablePolicy, as_tuple
 from physai.artifact.states import States
-from physai.deploy.metadata import ERROR, LAST_COMMAND, MEMORY, NEW_MEMORY, Metadata
+from physai.deploy.metadata import ERROR, LAST_COMMAND, MEMORY, NEW_MEMORY, Metadata, describe_region
 from physai.deploy.policy import load_module
 from physai.envs.make import TransformedRobotEnv
 from physai.envs.simulation import Simulation
@@ -239,12 +240,19 @@ def check_metadata(metadata: Metadata, simulation: Simulation, policy: Deployabl
         "control_rate": 1.0 / simulation.config.control_dt,
         "inputs": policy.inputs,
         "outputs": policy.outputs,
-        "region": task.region,
         "tolerances": task.tolerances,
     }
     for key, value in true.items():
         said = getattr(metadata, key)
         if not (np.array_equal(said, value) if isinstance(value, np.ndarray) else said == value):
+            raise GateError(f"the metadata is wrong: {key} is {said}, not {value}")
+    model = capsules(simulation)
+    described = {
+        "goal.region": (describe_region(metadata.region), describe_region(task.region)),
+        "collision": tuple(None if each is None else each.describe() for each in (metadata.collision, model)),
+    }
+    for key, (said, value) in described.items():
+        if said != value:
             raise GateError(f"the metadata is wrong: {key} is {said}, not {value}")
     urdf = hashlib.sha256(spec.urdf.read_bytes()).hexdigest()
     if metadata.raw["robot"]["urdf_sha256"] != urdf:

@@ -87,6 +87,18 @@ class CollisionModel:
             distance[rows] = self._shapes.distance(self.motions.frames(joint_position[rows])).T
         return distance
 
+    def inside(self, point: np.ndarray) -> str | None:
+        """Name what stands still and holds a point in the base frame [3], m: a link of the base, the floor or a box."""
+        for capsule in self.capsules:
+            start, way = np.array(capsule.start), np.array(capsule.end) - np.array(capsule.start)
+            along = np.clip((point - start) @ way / max(way @ way, 1e-12), 0.0, 1.0)
+            if not capsule.body and np.linalg.norm(point - start - along * way) < capsule.radius:
+                return capsule.link
+        if self.floor is not None and point[2] < self.floor:
+            return "floor"
+        held = (box.name for box in self.boxes if (np.abs(point - np.array(box.center)) < box.half_size).all())
+        return next(held, None)
+
     def describe(self) -> dict[str, Any]:
         """Return plain numbers, texts and lists, as JSON holds them."""
         return {

@@ -13,6 +13,7 @@ from physai.deploy.checked import AnswerError, CheckedPolicy
 from physai.deploy.command import Command, State
 from physai.deploy.following import Following, Progress, Strain
 from physai.deploy.goals import Goal, GoalError, accept
+from physai.deploy.guard import CollisionGuard
 from physai.deploy.interfaces import INTERFACES
 from physai.deploy.joints import Heard, JointReader, JointState, JointStateError
 from physai.deploy.limits import LATE, VelocityLimits, check
@@ -74,6 +75,7 @@ class Controller:
         self._needed = 0  # good joint states until a hold ends
         self._hold_reason = ""
         self._gave_up = ""  # why this goal is not pursued any more
+        self._guarded = False  # whether the guard held the last motion back
         self._failures = 0  # of the policy, in a row
         self._command = Command(None, State.WAITING, ())
         self._since = 0.0
@@ -85,11 +87,13 @@ class Controller:
             UserError: If the limits do not fit the robot; those of before stay.
         """
         check(config, self.policy.metadata)
+        guard = CollisionGuard(self.policy.metadata, config)
         self.config = config
         self._robot.configure(config)
         self._limits = VelocityLimits(self.policy.metadata, config)
         self._interface.configure(config, self._limits)
         self._following = Following(self.policy.metadata, config)
+        self._guard = guard
         self._check_position()
 
     def update(
@@ -130,11 +134,12 @@ class Controller:
             reasons.append(self._hold("state old", f"the last {what} is {now - self._received:.3f} s old"))
         state = self._state(interlocks, reasons)
         elapsed = min(passed, self._period)
-        velocity, memory = None, self._asked.nothing
+        velocity, memory, self._guarded = None, self._asked.nothing, False
         if state is State.ACTIVE:
             if not stop:
                 velocity, memory = self._drive(elapsed, reasons)
-            state = State.HOLD if self._gave_up else State.REACHED if self._reached else State.ACTIVE
+            holds = self._gave_up or self._guarded
+            state = State.HOLD if holds else State.REACHED if self._reached else State.ACTIVE
         if self._latched not in (None, state):  # an emergency stop while the policy was asked, or a policy that failed
             velocity, memory, state = None, self._asked.nothing, self._latched
             reasons.append(self._latch_reason)
@@ -221,7 +226,8 @@ class Controller:
 
     def _take_goal(self, goal: Goal, reasons: list[str]) -> None:
         try:
-            new, projected = accept(goal, self.policy.metadata, self.config.unreachable_goal == "project")
+            project = self.config.unreachable_goal == "project"
+            new, projected = accept(goal, self.policy.metadata, project, self._guard.inside)
         except GoalError as rejected:
             self._counters[f"goals rejected: {rejected.kind}"] += 1
             reasons.append(str(rejected))
@@ -352,6 +358,11 @@ class Controller:
         if held_back is not None:
             self._counters["ticks at a position limit"] += 1
             reasons.append(held_back)
+        if (nearing := self._guard.held_back(robot.position, velocity)) is not None:
+            self._counters["ticks held back by the collision guard"] += 1
+            reasons.append(nearing)
+            self._guarded, self._hold_reason = True, nearing
+            return None, self._asked.nothing
         return velocity, self._remember(memory, elapsed)
 
     def _send(self, velocity: np.ndarray | None, elapsed: float, reasons: list[str]) -> np.ndarray | None:

@@ -1,6 +1,6 @@
 """Goals from outside: which are taken, and which are not."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -35,11 +35,19 @@ class GoalError(Exception):
         self.kind = kind
 
 
-def accept(goal: Goal, metadata: Metadata, project: bool) -> tuple[np.ndarray, bool]:
+def accept(
+    goal: Goal, metadata: Metadata, project: bool, inside: Callable[[np.ndarray], str | None] = lambda _: None
+) -> tuple[np.ndarray, bool]:
     """Return the goal's numbers in the signal's order, and whether they were moved into the region of goals.
 
+    Args:
+        goal: What came.
+        metadata: What the policy takes.
+        project: Whether a goal out of reach may be moved.
+        inside: Names what a point in the base frame [3], m, lies in.
+
     Raises:
-        GoalError: If it is not made of finite numbers, in another frame, or out of reach.
+        GoalError: If it is not made of finite numbers, in another frame, out of reach, or in something.
     """
     signal = metadata.goal
     value = to_floats(goal.value) if isinstance(goal, Goal) else None
@@ -57,12 +65,16 @@ def accept(goal: Goal, metadata: Metadata, project: bool) -> tuple[np.ndarray, b
         raise GoalError("wrong frame", f"frame '{goal.frame}' is not '{signal.frame}'")
     if signal.quantity is Quantity.POSE:
         value = _normalized(value)
-    if metadata.region.contains(value):
-        return value, False
-    projected = metadata.region.project(value) if project else None
-    if projected is None:
+    projected = (
+        None if (contained := metadata.region.contains(value)) or not project else metadata.region.project(value)
+    )
+    if not contained and projected is None:
         raise GoalError("unreachable", metadata.region.describe(value))
-    return projected, True
+    taken = value if projected is None else projected
+    in_space = signal.quantity in (Quantity.POSITION, Quantity.POSE) and signal.size > 2
+    if in_space and (name := inside(taken[:3])) is not None:
+        raise GoalError("in something", f"it lies in '{name}'")
+    return taken, not contained
 
 
 def _normalized(pose: np.ndarray) -> np.ndarray:

@@ -8,18 +8,20 @@ from typing import Any
 
 import numpy as np
 
+from physai.collision import CollisionModel
 from physai.errors import UserError
 from physai.signals import Quantity, Region, Signal, Tolerance
 from physai.signals.region import REGIONS
 
 FORMAT = "physai.policy"
-FORMAT_VERSION = 2
+FORMAT_VERSION = 3
 GOAL = "goal"
 LAST_COMMAND = "last_command"  # what was sent before: an input of policies that command positions
 MEMORY, NEW_MEMORY = "memory", "new_memory"  # of a policy that remembers: a further input, a further output
 ERROR = "error"  # how far the robot is from a goal, which the controller asks for
 MAX_PAIRS = 1000
 MAX_SIZE = 65536  # numbers of a signal
+_MAX_SHAPES = 2000
 _COMMANDS = (Quantity.JOINT_VELOCITY, Quantity.JOINT_POSITION)
 # What a controller does not need, but people do.
 _FOR_PEOPLE = {
@@ -59,6 +61,7 @@ class Metadata:
         outputs: What it gives, in order; first the command.
         region: Where goals lie.
         tolerances: Errors that count as reached, one for each error that the policy tells.
+        collision: The robot's capsules, and what it was trained not to touch; None where it has none.
         golden: Inputs, and the outputs and errors that the policy gave for them when it was exported, by name; float32,
             [pairs, ...].
         content_sha256: Hash of the code and weights that this describes.
@@ -77,6 +80,7 @@ class Metadata:
     outputs: tuple[Signal, ...]
     region: Region
     tolerances: tuple[Tolerance, ...]
+    collision: CollisionModel | None
     golden: dict[str, np.ndarray]
     content_sha256: str
 
@@ -152,6 +156,7 @@ class Metadata:
             outputs=outputs,
             region=region,
             tolerances=tolerances,
+            collision=_collision(raw, n),
             golden={key: _array(raw, f"golden.{key}", shape, kind=np.float32) for key, shape in shapes.items()},
             content_sha256=_get(raw, "content_sha256", str),
         )
@@ -282,6 +287,22 @@ def _region(raw: dict[str, Any]) -> Region:
         return REGIONS[kind](**fields)
     except (TypeError, ValueError, OverflowError) as error:
         raise PolicyError(f"metadata: goal.region: {' '.join(str(error).split())[:120]}") from error
+
+
+def _collision(raw: dict[str, Any], joints: int) -> CollisionModel | None:
+    told = _get(raw, "collision", object)
+    if told is None:
+        return None
+    try:
+        most = max((len(value) for value in told.values() if isinstance(value, list)), default=0)
+        if most > _MAX_SHAPES:
+            raise ValueError(f"a list of more than {_MAX_SHAPES:,}")
+        model = CollisionModel.from_description(told)
+    except (TypeError, ValueError, AttributeError, OverflowError, RecursionError) as error:
+        raise PolicyError(f"metadata: collision: {' '.join(str(error).split())[:160]}") from error
+    if len(model.motions) != joints:
+        raise PolicyError(f"metadata: collision.motions are of {len(model.motions)} joints, not {joints}")
+    return model
 
 
 def _tolerance(raw: dict[str, Any], key: str) -> Tolerance:

@@ -115,5 +115,17 @@ class ControllerConfig(Parameters):
     progress_timeout: float = parameter(
         10.0, "a distance that has not fallen for this long ends the motion", "s", 0.1, 3600.0
     )
+    collision_margin: float = parameter(
+        0.01, "no motion that brings links closer than this to each other, to the floor or to a box", "m", 0.0, 1.0
+    )
+    stopping_time: float = parameter(
+        0.12, "what the arm needs to stop; so far ahead collisions are seen", "s", 0.0, 2.0
+    )
+    floor: tuple[float, ...] = parameter(
+        (), "its height in the base frame; empty: as in the policy file", "m", -100.0, 100.0
+    )
+    boxes: tuple[float, ...] = parameter(
+        (), "what stands around: x, y, z of a centre and of half the edges, box by box", "m", -100.0, 100.0
+    )
     effort_time: float = parameter(0.5, "an effort beyond its limit for this long is a fault", "s", 0.0, 60.0)
     clock_jump: float = parameter(1.0, "an update later than this is a jump of the clock", "s", 0.01, 3600.0)

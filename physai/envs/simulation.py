@@ -163,7 +163,10 @@ class Simulation:
         self._delay.reset(rows, standing, delay)
 
     def _start(self, rows: np.ndarray, ended: RobotState) -> RobotState:
-        """Draw where the episodes of some rows begin: within the limits, or where the last ones ended."""
+        """Draw where the episodes of some rows begin: within the limits, or where the last ones ended.
+
+        Where the robot would touch something, it begins at home.
+        """
         config, spec, count = self.config.start, self.spec, len(rows)
         position = np.tile(spec.home, (count, 1))
         velocity = np.zeros_like(position)
@@ -175,6 +178,9 @@ class Simulation:
             carried &= self.started[rows, None]
             position = np.where(carried, ended.joint_position[rows], position)
             velocity = np.where(carried, ended.joint_velocity[rows], velocity)
+        if (clearance := self.task.clearance(position)) is not None:
+            touches = clearance[:, None] <= 0
+            position, velocity = np.where(touches, spec.home, position), np.where(touches, 0.0, velocity)
         return RobotState(position, velocity)
 
     def _standing(self, state: RobotState) -> np.ndarray:
@@ -223,7 +229,8 @@ class Simulation:
 
     def _step(self, command: np.ndarray, action: np.ndarray) -> Step:
         held = self.within * self.config.control_dt
-        return Step(self.state, command, action, self.last_action, self.goal, self.error, held)
+        clearance = self.task.clearance(self.state.joint_position)
+        return Step(self.state, command, action, self.last_action, self.goal, self.error, held, clearance)
 
     def observe(self) -> np.ndarray:
         """Return what a policy sees of the true state, [N, o], float32."""

@@ -7,6 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from physai.collision import CollisionModel
 from physai.physics import RobotState
 from physai.signals import Region, Signal, Tolerance
 
@@ -40,6 +41,7 @@ class Step:
         goal: [N, g].
         error: How far they are from it, one column a tolerance, [N, e].
         held: For how long all errors have been within their tolerances without a break, s, [N].
+        clearance: How far the robots are from touching anything, m, [N]; None where the task does not look at that.
     """
 
     state: RobotState
@@ -49,6 +51,7 @@ class Step:
     goal: np.ndarray
     error: np.ndarray
     held: np.ndarray
+    clearance: np.ndarray | None = None
 
 
 class Task(Protocol):
@@ -64,6 +67,7 @@ class Task(Protocol):
         observation: What the observation module makes, with bounds.
         module: The observation module.
         max_steps: Control steps until an episode is truncated.
+        surroundings: The robot's capsules and what stands around, where the task looks at collisions; else None.
     """
 
     goal: Signal
@@ -72,6 +76,7 @@ class Task(Protocol):
     observation: Signal
     module: ObservationModule
     max_steps: int
+    surroundings: CollisionModel | None = None
 
     def success(self, step: Step) -> np.ndarray:
         """Whether the robots do what they shall, [N]; an episode is a success if its last step is one."""
@@ -85,6 +90,9 @@ class Task(Protocol):
     def sample_goal(self, rows: int, generator: torch.Generator) -> np.ndarray:
         """Draw goals of episodes, [rows, g]."""
         return self.region.sample(rows, generator)
+
+    def clearance(self, joint_position: np.ndarray) -> np.ndarray | None:
+        """Return how far robots [N, n], rad, are from touching anything, m, [N]; None: the task does not look at that."""
 
     @torch.no_grad()
     def error(self, state: RobotState, goal: np.ndarray) -> np.ndarray:

@@ -15,6 +15,10 @@ from physai.tasks.reach_position import Posture, goals_in, space_observation
 from physai.tasks.reaching import Reaching
 
 
+_KNOWN = 1024  # configurations in the policy file
+_BENT = 0.02  # m², by which a pose may be farther whose configuration is nearer to home
+
+
 class ReachPoseObservation(ObservationModule):
     """As :class:`physai.tasks.reach_position.ReachPositionObservation`, with what turns the end effector.
 
@@ -23,17 +27,37 @@ class ReachPoseObservation(ObservationModule):
     features come the rotation vector r from the end effector to the goal and J_ωᵀr, the direction in joint space that
     shortens it fastest.
 
+    Following these alone, arms get stuck at their joint limits: many poses need another way to bend. So the module holds
+    configurations and the poses that they lead to, and shows how far the joints are from the one whose pose is nearest
+    to the goal: where roughly to go, whatever was before.
+
     Args:
         spec: The robot.
         kinematics: Its forward kinematics.
         tolerance: Distance that counts as reached, m.
         angle_tolerance: Angle that counts as reached, rad.
+        known: Configurations [K, n], rad, and the poses that they lead to, [K, 7].
     """
 
     def __init__(
-        self, spec: RobotSpec, kinematics: ForwardKinematics, tolerance: float, angle_tolerance: float
+        self,
+        spec: RobotSpec,
+        kinematics: ForwardKinematics,
+        tolerance: float,
+        angle_tolerance: float,
+        known: tuple[np.ndarray, np.ndarray],
     ) -> None:
         super().__init__()
+        configurations, poses = (torch.from_numpy(array).float() for array in known)
+        self.configurations: Tensor
+        self.places: Tensor
+        self.lengths: Tensor
+        self.register_buffer("configurations", configurations)
+        places = self._place(poses[:, :3], quaternion_matrix(poses[:, 3:]))
+        self.register_buffer("places", places.T.contiguous())
+        half = torch.from_numpy((spec.position_limit[:, 1] - spec.position_limit[:, 0]) / 2).float()
+        bent = ((configurations - torch.from_numpy(spec.home).float()) / half).square().mean(dim=1)
+        self.register_buffer("lengths", places.square().sum(dim=1) + _BENT * bent)
         self.kinematics = kinematics
         length, n = kinematics.reach, len(spec.joints)
         joints = [1.0 / (length * tolerance)] * n + [0.5 / angle_tolerance] * n
@@ -49,7 +73,7 @@ class ReachPoseObservation(ObservationModule):
         """Map positions [N, n] rad, velocities [N, n] rad/s and goals [N, 7] to observation and features.
 
         Returns:
-            Observation [N, 2n + 12] and features [N, 7n + 12].
+            Observation [N, 2n + 12] and features [N, 9n + 12].
         """
         sine, cosine = torch.sin(joint_position), torch.cos(joint_position)
         linear, rotation, angular = self.kinematics.linearize_pose(cosine, sine)
@@ -61,9 +85,21 @@ class ReachPoseObservation(ObservationModule):
         errors = torch.cat([error, turn, shift, swing], dim=1)
         wrapped, away = self.posture(joint_position, sine, cosine)
         columns = wanted[:, :, :2].transpose(1, 2).flatten(1)
+        way = self.nearest(goal[:, :3], wanted) - joint_position
         observation = torch.cat([wrapped, joint_velocity, end_effector, goal[:, :3], columns], dim=1)
-        features = torch.cat([sine, cosine, away, errors * self.coarse, torch.tanh(errors * self.fine)], dim=1)
+        bends = torch.cat([sine, cosine, away, way, torch.tanh(4.0 * way)], dim=1)
+        features = torch.cat([bends, errors * self.coarse, torch.tanh(errors * self.fine)], dim=1)
         return observation, features
+
+    @torch.jit.export
+    def nearest(self, position: Tensor, rotation: Tensor) -> Tensor:
+        """Map positions [N, 3], m, and rotation matrices [N, 3, 3] to the configuration of the nearest pose, [N, n]."""
+        apart = self.lengths - 2.0 * torch.matmul(self._place(position, rotation), self.places)
+        return self.configurations[apart.argmin(dim=1)]
+
+    def _place(self, position: Tensor, rotation: Tensor) -> Tensor:
+        """Poses as points, whose distance is that of the positions and of the angles, at 0.3 m/rad."""
+        return torch.cat([position, 0.21 * rotation.flatten(1)], dim=1)
 
     @torch.jit.export
     def error(self, joint_position: Tensor, goal: Tensor) -> Tensor:
@@ -79,7 +115,7 @@ class ReachPose(Reaching):
     Args:
         spec: The robot.
         kinematics: Its forward kinematics.
-        region: Where goals lie: a :class:`physai.tasks.ReachableGoals`, partly made.
+        region: Where goals lie: :class:`physai.tasks.ReachableGoals`, partly made.
         tolerance: Distance that counts as reached, m.
         angle_tolerance: Angle that counts as reached, rad.
         angle_weight: What an angle costs in the reward, m/rad.
@@ -98,11 +134,12 @@ class ReachPose(Reaching):
     ) -> None:
         tolerances = Tolerance("distance", "m", tolerance), Tolerance("angle", "rad", angle_tolerance)
         super().__init__(spec, tolerances, (1.0, angle_weight), **judging)
-        self._goals = goals_in(region, spec, kinematics, Quantity.POSE)
-        self.region: Region = getattr(self._goals, "region", self._goals)
+        self._goals = goals_in(region, spec, kinematics, Quantity.POSE, self.surroundings)
+        self.region: Region = self._goals.region
         low, high = (tuple(bound.tolist()) for bound in self.region.bounds)
         self.goal = Signal("goal", Quantity.POSE, (7,), low, high, ("x", "y", "z", "qx", "qy", "qz", "qw"), spec.base)
-        self.module = ReachPoseObservation(spec, kinematics, tolerance, angle_tolerance)
+        known = self._goals.known(_KNOWN)
+        self.module = ReachPoseObservation(spec, kinematics, tolerance, angle_tolerance, known)
         low, high = self.region.bounds
         seen = np.concatenate([low[:3], np.full(6, -1.0)]), np.concatenate([high[:3], np.ones(6)])
         self.observation = space_observation(spec, kinematics, seen)
@@ -110,3 +147,9 @@ class ReachPose(Reaching):
     def sample_goal(self, rows: int, generator: torch.Generator) -> np.ndarray:
         """See :class:`physai.tasks.Task`."""
         return self._goals.sample(rows, generator)
+
+    @torch.no_grad()
+    def rest(self, goal: np.ndarray) -> np.ndarray:
+        """See :class:`Reaching`: the known configuration whose pose is nearest."""
+        pose = torch.from_numpy(goal).float()
+        return self.module.nearest(pose[:, :3], quaternion_matrix(pose[:, 3:])).double().numpy()

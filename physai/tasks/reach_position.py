@@ -7,6 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from physai.collision import CollisionModel
 from physai.config import PositiveFloat
 from physai.errors import UserError
 from physai.robots import ForwardKinematics, RobotSpec
@@ -111,7 +112,7 @@ class ReachPosition(Reaching):
         **judging: Any,
     ) -> None:
         super().__init__(spec, (Tolerance("distance", "m", tolerance),), (1.0,), **judging)
-        self._goals = goals_in(region, spec, kinematics, Quantity.POSITION)
+        self._goals = goals_in(region, spec, kinematics, Quantity.POSITION, self.surroundings)
         self.region: Region = getattr(self._goals, "region", self._goals)
         low, high = (tuple(bound.tolist()) for bound in self.region.bounds)
         self.goal = Signal("goal", Quantity.POSITION, (3,), low, high, ("x", "y", "z"), spec.base)
@@ -124,7 +125,11 @@ class ReachPosition(Reaching):
 
 
 def goals_in(
-    region: Any, spec: RobotSpec, kinematics: ForwardKinematics, quantity: Quantity
+    region: Any,
+    spec: RobotSpec,
+    kinematics: ForwardKinematics,
+    quantity: Quantity,
+    surroundings: CollisionModel | None,
 ) -> Region | ReachableGoals:
     """Return what draws goals in space.
 
@@ -133,12 +138,13 @@ def goals_in(
         spec: The robot.
         kinematics: Its forward kinematics.
         quantity: What a goal is.
+        surroundings: What the robot must not touch; None where that is not looked at.
 
     Raises:
         UserError: If it is no such region, or part of it is beyond the robot's reach.
     """
     if callable(region):
-        made: ReachableGoals = region(spec, kinematics, quantity)
+        made: ReachableGoals = region(spec, kinematics, quantity, surroundings=surroundings)
         return made
     if quantity is not Quantity.POSITION or not isinstance(region, Box | Ball) or len(region.bounds[0]) != 3:
         raise UserError(
@@ -146,6 +152,12 @@ def goals_in(
             + (", or a physai.signals.Box or Ball of three numbers" if quantity is Quantity.POSITION else "")
         )
     low, high = region.bounds
+    floor = None if surroundings is None else surroundings.floor
+    if surroundings is not None and (surroundings.boxes or (floor is not None and low[2] <= floor)):
+        raise UserError(
+            "env.task.region: some of these goals may be in a box or below the floor; a physai.tasks.ReachableGoals "
+            "(_partial_: true) draws those that the arm reaches"
+        )
     shoulder = kinematics.shoulder
     nearest = np.linalg.norm(np.clip(shoulder, low, high) - shoulder)
     farthest = np.linalg.norm(np.maximum(np.abs(low - shoulder), np.abs(high - shoulder)))

@@ -6,6 +6,7 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
+from physai.collision import CollisionModel
 from physai.config import PositiveFloat
 from physai.errors import UserError
 from physai.robots import ForwardKinematics, RobotSpec
@@ -27,6 +28,7 @@ class ReachableGoals:
         low: Smallest x, y, z, m.
         high: Largest x, y, z, m.
         share: Of each joint's range, around its middle, that configurations are drawn from.
+        surroundings: What the robot must not touch; it must not touch itself either.
 
     Attributes:
         region: What a policy file says about it, with examples.
@@ -43,39 +45,49 @@ class ReachableGoals:
         low: Sequence[float],
         high: Sequence[float],
         share: PositiveFloat,
+        surroundings: CollisionModel | None = None,
     ) -> None:
         lower, upper = np.where(spec.continuous, [[-np.pi], [np.pi]], spec.position_limit.T)
         middle, half = (lower + upper) / 2, share * (upper - lower) / 2
         self._lower, self._upper = middle - half, middle + half
         self._low, self._high = np.array(low), np.array(high)
-        self._kinematics, self._quantity = kinematics, quantity
+        self._kinematics, self._quantity, self._surroundings = kinematics, quantity, surroundings
         self._pool = self._draw_pool(torch.Generator().manual_seed(0))
         turns = [1.0] * (4 if quantity is Quantity.POSE else 0)
         examples = self._goals(self._pool[:_EXAMPLES])
         self.region = Reachable((*low, *[-each for each in turns]), (*high, *turns), tuple(examples.ravel().tolist()))
 
+    def known(self, count: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return configurations [count, n], rad, and the goals that they lead to, [count, g]."""
+        return self._pool[:count], self._goals(self._pool[:count])
+
     def sample(self, rows: int, generator: torch.Generator) -> np.ndarray:
         """Draw goals [rows, g]: a configuration of the pool, of which each joint is moved a little."""
         known = self._pool[torch.randint(len(self._pool), (rows,), generator=generator).numpy()]
         draw = torch.rand(known.shape, generator=generator, dtype=torch.float64).numpy()
-        goals = self._goals(np.clip(known + _NEAR * (2 * draw - 1), self._lower, self._upper))
-        return np.where(self._inside(goals)[:, None], goals, self._goals(known))
+        moved = np.clip(known + _NEAR * (2 * draw - 1), self._lower, self._upper)
+        goals = self._goals(moved)
+        return np.where(self._allowed(moved, goals)[:, None], goals, self._goals(known))
 
     def _draw_pool(self, generator: torch.Generator) -> np.ndarray:
         found: list[np.ndarray] = []
         for _ in range(_BATCHES):
             draw = torch.rand(_POOL, len(self._lower), generator=generator, dtype=torch.float64).numpy()
             configurations = self._lower + (self._upper - self._lower) * draw
-            found.append(configurations[self._inside(self._goals(configurations))])
+            found.append(configurations[self._allowed(configurations, self._goals(configurations))])
             if sum(map(len, found)) >= _POOL:
                 return np.concatenate(found)[:_POOL]
         raise UserError(
-            f"env.task.region: of {_BATCHES * _POOL:,} configurations of the robot only {sum(map(len, found)):,} lead "
-            f"into the box from {self._low.tolist()} to {self._high.tolist()}"
+            f"env.task.region: of {_BATCHES * _POOL:,} configurations of the robot only {sum(map(len, found)):,} lead, "
+            f"without touching anything, into the box from {self._low.tolist()} to {self._high.tolist()}"
         )
 
-    def _inside(self, goals: np.ndarray) -> np.ndarray:
-        return ((goals[:, :3] >= self._low) & (goals[:, :3] <= self._high)).all(axis=1)
+    def _allowed(self, configurations: np.ndarray, goals: np.ndarray) -> np.ndarray:
+        allowed = ((goals[:, :3] >= self._low) & (goals[:, :3] <= self._high)).all(axis=1)
+        if self._surroundings is not None:
+            inside = allowed.nonzero()[0]
+            allowed[inside] = (self._surroundings.distance(configurations[inside]) > 0).all(axis=1)
+        return allowed
 
     @torch.no_grad()
     def _goals(self, configurations: np.ndarray) -> np.ndarray:

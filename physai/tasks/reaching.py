@@ -2,10 +2,14 @@
 
 import numpy as np
 
-from physai.config import Count, NonNegativeFloat
+from physai.collision import Box
+from physai.config import Count, NonNegativeFloat, PositiveFloat
+from physai.errors import UserError
 from physai.robots import RobotSpec
 from physai.signals import Tolerance
 from physai.tasks.interface import Step, Task
+
+_NEAR = 0.02  # what being all but in touch costs in a step, as a share of a collision
 
 
 class Reaching(Task):
@@ -19,9 +23,16 @@ class Reaching(Task):
         success_ends: Whether success ends the episode; else a policy learns to stay there until time is up.
         settle: How long the end effector must stay there to succeed, s; with 0 touching the goal is enough.
         smoothness: Weight of what changes of the action cost: their mean over the joints, as a share of the action.
-        posture: Weight of what being away from home costs: the mean over the joints of the square of the distance, as a
+        posture: Weight of what being away from ``rest`` costs, which is home: the mean over the joints of the square of the distance, as a
             share of half the joint's range. It keeps an arm from winding up into its limits, goal after goal.
+        collision: What touching itself, the floor or a box costs, which ends the episode; 0: nothing is looked at.
+        safe_distance: Nearer than this, m, costs a share of ``collision`` in each step.
+        floor: Its height in the base frame, m; None where there is none.
+        boxes: What else stands around, with faces along the axes of the base frame: :class:`physai.collision.Box`.
         max_steps: Control steps until an episode is truncated.
+
+    Raises:
+        UserError: If collisions are to be looked at, and the robot's YAML names no capsules.
     """
 
     def __init__(
@@ -34,6 +45,10 @@ class Reaching(Task):
         settle: NonNegativeFloat,
         smoothness: NonNegativeFloat,
         posture: NonNegativeFloat,
+        collision: NonNegativeFloat,
+        safe_distance: PositiveFloat,
+        floor: float | None,
+        boxes: list[Box],
         max_steps: Count,
     ) -> None:
         self.tolerances = tolerances
@@ -41,6 +56,14 @@ class Reaching(Task):
         self._weights = weights
         self._success_reward, self._success_ends, self._settle = success_reward, success_ends, settle
         self._smoothness, self._posture = smoothness, posture
+        self._collision, self._safe_distance = collision, safe_distance
+        if collision:
+            if spec.collision is None:
+                raise UserError(
+                    f"env.task.collision: the YAML of '{spec.name}' names no capsules: python -m physai.capsules "
+                    f"robot={spec.name} fits them"
+                )
+            self.surroundings = spec.collision.within(floor, boxes)
         self._home = spec.home
         self._half_range = (spec.position_limit[:, 1] - spec.position_limit[:, 0]) / 2
 
@@ -49,11 +72,20 @@ class Reaching(Task):
         return (step.held > 0) & (step.held >= self._settle - 1e-9)
 
     def terminated(self, step: Step, success: np.ndarray) -> np.ndarray:
-        """Success ends the episode, or nothing does."""
-        return success if self._success_ends else np.zeros_like(success)
+        """A collision ends the episode, and success may."""
+        over = success if self._success_ends else np.zeros_like(success)
+        return over if step.clearance is None else over | (step.clearance <= 0)
+
+    def clearance(self, joint_position: np.ndarray) -> np.ndarray | None:
+        """See :class:`physai.tasks.Task`."""
+        return None if self.surroundings is None else self.surroundings.distance(joint_position).min(axis=1)
+
+    def rest(self, goal: np.ndarray) -> np.ndarray:
+        """Return the posture to which the ``posture`` term draws robots with goals [N, g]: [n] or [N, n], rad."""
+        return self._home
 
     def rewards(self, step: Step, success: np.ndarray) -> dict[str, np.ndarray]:
-        """Minus the errors, the bonus, and what changing the action and being away from home cost, if they do."""
+        """Minus the errors, the bonus, and what changing the action, being away from home and collisions cost."""
         terms = {
             tolerance.name: -weight * step.error[:, column]
             for column, (tolerance, weight) in enumerate(zip(self.tolerances, self._weights, strict=True))
@@ -62,6 +94,9 @@ class Reaching(Task):
         if self._smoothness:
             terms["smoothness"] = -self._smoothness * np.abs(step.action - step.last_action).mean(axis=1)
         if self._posture:
-            away = (step.state.joint_position - self._home) / self._half_range
+            away = (step.state.joint_position - self.rest(step.goal)) / self._half_range
             terms["posture"] = -self._posture * np.square(away).mean(axis=1)
+        if step.clearance is not None:
+            near = np.clip(1.0 - step.clearance / self._safe_distance, 0.0, 1.0)
+            terms["collision"] = -self._collision * np.where(step.clearance <= 0, 1.0, _NEAR * near)
         return terms

@@ -19,7 +19,7 @@ def of_joints(name, quantity, joints):
     return Signal.of_joints(name, Quantity(quantity), joints, -most, most)
 
 
-def policy_file(module, joints, inputs, outputs, region, tolerances) -> bytes:
+def policy_file(module, joints, inputs, outputs, region, tolerances, collision=None) -> bytes:
     """A policy file of a module: joints within 3 rad, commands of 2 rad/s, at 50 Hz."""
     n, scripted = len(joints), torch.jit.script(module.eval())
     draw = torch.Generator().manual_seed(0)
@@ -41,6 +41,7 @@ def policy_file(module, joints, inputs, outputs, region, tolerances) -> bytes:
             "region": describe_region(region),
             "tolerances": [{"name": one.name, "unit": one.unit, "value": one.value} for one in tolerances],
         },
+        "collision": None if collision is None else collision.describe(),
         "golden": {name: value.tolist() for name, value in golden.items()},
         "content_sha256": content_sha256(save(scripted)),
     }

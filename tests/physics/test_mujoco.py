@@ -11,7 +11,6 @@ import torch
 
 from physai.compose import compose
 from physai.config import validate
-from physai.errors import UserError
 from physai.physics import ParameterLayout, RandomizationConfig
 from physai.physics.mujoco import MuJoCoPhysics
 from physai.robots import RobotSpec
