@@ -1,8 +1,10 @@
 """What tests share: one thread, the environments that physai comes with, and runs that are made once."""
 
 import os
+import runpy
 import shutil
 import signal
+import sys
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -15,6 +17,7 @@ for library in ("OMP", "MKL", "OPENBLAS"):
 import pytest
 import torch
 from filelock import FileLock
+from hydra.core.global_hydra import GlobalHydra
 from hypothesis import HealthCheck, settings
 from omegaconf import OmegaConf
 
@@ -50,6 +53,27 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     wanted = [item for item in items if (item.get_closest_marker("realtime") is not None) == (chosen == "only")]
     config.hook.pytest_deselected(items=[item for item in items if item not in wanted])
     items[:] = wanted
+
+
+@pytest.fixture
+def run(tmp_path, monkeypatch, capsys):
+    """Run a command in this process, in an empty folder; return exit code, standard output and error."""
+
+    def run(module, *arguments):
+        monkeypatch.chdir(tmp_path)
+        monkeypatch.setattr(sys, "argv", [f"physai.{module}", *arguments])
+        monkeypatch.setenv("COLUMNS", "200")
+        GlobalHydra.instance().clear()
+        for name in (f"physai.{module}", f"physai.{module}.__main__"):
+            monkeypatch.delitem(sys.modules, name, raising=False)  # no second copy of it
+        try:
+            runpy.run_module(f"physai.{module}", run_name="__main__")
+            code = 0
+        except SystemExit as stop:
+            code = stop.code or 0
+        return code, *capsys.readouterr()
+
+    return run
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -9,7 +9,6 @@ from omegaconf import OmegaConf
 from physai.physics.shapes import ShapeCollisions
 from physai.robots import RobotConfig, RobotSpec
 from tests.robots.test_collision import changed, config_of
-from tests.training.small import command
 
 LINK = """<link name="{name}">
   <inertial><mass value="1"/><inertia ixx="0.01" iyy="0.01" izz="0.01" ixy="0" ixz="0" iyz="0"/></inertial>
@@ -54,11 +53,11 @@ def folding(path, collision: dict | None) -> RobotSpec:
     return changed(RobotConfig.model_validate({**config_of("planar_arm").model_dump(), **given}), collision)
 
 
-def test_capsules_are_written_and_drawn_and_a_robot_takes_them(tmp_path):
+def test_capsules_are_written_and_drawn_and_a_robot_takes_them(tmp_path, run):
     path = write_arm(tmp_path, FOOT, BAR, BAR, "")
-    done = command("capsules", *overrides(path, output="found.yaml"), cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
-    assert "capsules miss 0.00% of these" in done.stdout
+    code, said, error = run("capsules", *overrides(path, output="found.yaml"))
+    assert code == 0, error
+    assert "capsules miss 0.00% of these" in said
     assert (tmp_path / "found.png").read_bytes().startswith(b"\x89PNG")
     spec = folding(path, OmegaConf.to_container(OmegaConf.load(tmp_path / "found.yaml")))
     assert set(spec.collision.names) == {("foot", "fore")}
@@ -72,10 +71,10 @@ def test_capsules_are_written_and_drawn_and_a_robot_takes_them(tmp_path):
     assert (alarm & ~touching).mean() < 0.08
 
 
-def test_a_robot_on_which_nothing_can_meet_gets_capsules_without_pairs(tmp_path):
+def test_a_robot_on_which_nothing_can_meet_gets_capsules_without_pairs(tmp_path, run):
     path = write_arm(tmp_path, "", BAR, BAR, "")
-    done = command("capsules", *overrides(path, output="found.yaml"), cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
+    code, _, error = run("capsules", *overrides(path, output="found.yaml"))
+    assert code == 0, error
     assert OmegaConf.load(tmp_path / "found.yaml").pairs == []
 
 
@@ -88,10 +87,9 @@ def test_a_robot_on_which_nothing_can_meet_gets_capsules_without_pairs(tmp_path)
         ((FOOT, BAR, BAR.replace("box", "cone"), ""), {}, "link 'fore': its <collision> is a <cone>, not a mesh"),
     ],
 )
-def test_what_cannot_be_fitted_ends_in_one_line(collisions, more, words, tmp_path):
+def test_what_cannot_be_fitted_ends_in_one_line(collisions, more, words, tmp_path, run):
     path = write_arm(tmp_path, *collisions)
-    done = command("capsules", *overrides(path, **{"output": "found.yaml", **more}), cwd=tmp_path)
-    assert done.returncode == 2
-    assert re.search(f"^error: .*{re.escape(words)}", done.stderr.splitlines()[-1])
-    assert "Traceback" not in done.stderr
+    code, _, error = run("capsules", *overrides(path, **{"output": "found.yaml", **more}))
+    assert code == 2
+    assert re.fullmatch(f"error: .*{re.escape(words)}.*\n", error)
     assert not (tmp_path / "found.yaml").exists()

@@ -2,14 +2,11 @@
 
 import json
 import os
-import runpy
 import shutil
-import sys
 from pathlib import Path
 from typing import ClassVar
 
 import pytest
-from hydra.core.global_hydra import GlobalHydra
 from hydra.experimental.callback import Callback
 from omegaconf import OmegaConf
 
@@ -17,27 +14,6 @@ from physai.compose import compose
 from tests.training.small import SMALL, command
 
 ROOT = Path(__file__).parent.parent
-
-
-@pytest.fixture
-def run(tmp_path, monkeypatch, capsys):
-    """Run a command in this process, in an empty folder; return exit code, standard output and error."""
-
-    def run(module, *arguments):
-        monkeypatch.chdir(tmp_path)
-        monkeypatch.setattr(sys, "argv", [f"physai.{module}", *arguments])
-        monkeypatch.setenv("COLUMNS", "200")
-        GlobalHydra.instance().clear()
-        for name in (f"physai.{module}", f"physai.{module}.__main__"):
-            monkeypatch.delitem(sys.modules, name, raising=False)  # no second copy of it
-        try:
-            runpy.run_module(f"physai.{module}", run_name="__main__")
-            code = 0
-        except SystemExit as stop:
-            code = stop.code or 0
-        return code, *capsys.readouterr()
-
-    return run
 
 
 def broken_urdf(tmp_path, old, new):

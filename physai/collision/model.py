@@ -13,7 +13,6 @@ from physai.collision.frames import Motions
 from physai.collision.segments import between_segments, from_boxes
 
 _BLOCK = 4096  # distances at a time: larger arrays leave the processor's cache, and each is asked of the system anew
-_BOXES = 4  # as many distances the arrays for one from a box are as large as
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +80,7 @@ class CollisionModel:
             that is not finite they may be NaN, which is not below zero either: ask for finite ones first.
         """
         distance = np.empty((len(joint_position), len(self.names)))
-        block = max(8, _BLOCK // max(len(self.pairs) + _BOXES * (len(self.names) - len(self.pairs)), 16))
+        block = max(8, _BLOCK // max(len(self.names), 16))
         for begin in range(0, len(joint_position), block):
             rows = slice(begin, begin + block)
             distance[rows] = self._shapes.distance(self.motions.frames(joint_position[rows])).T

@@ -1,6 +1,7 @@
 """Distances of a robot's capsules, and their way through a file."""
 
 import json
+import re
 import subprocess
 import sys
 
@@ -123,9 +124,8 @@ def _set(described: dict, path: list, value: object) -> None:
 def test_what_no_model_can_be_is_refused_in_one_line(path, value, words):
     described = arm().describe()
     _set(described, path, value)
-    with pytest.raises(ValueError, match=".") as caught:
+    with pytest.raises(ValueError, match=re.escape(words)) as caught:
         CollisionModel.from_description(described)
-    assert words in str(caught.value)
     assert len(str(caught.value).splitlines()) == 1
 
 

@@ -73,5 +73,5 @@ def test_a_policy_that_remembers_is_called_as_shown(recurrent_run, monkeypatch):
 
 
 def test_every_page_with_python_is_run():
-    assert {block.page for block in RUN} == {"README.md", "docs/train.md", "docs/deploy.md"}
+    assert {block.page for block in RUN} == {"README.md", "docs/train.md", "docs/deploy.md", "docs/extending.md"}
     assert all(isinstance(block, Block) for block in RUN)
