@@ -136,9 +136,11 @@ def _train_and_export(*arguments: Any) -> None:
     (run / ".hydra").mkdir()
     (run / ".hydra" / "config.yaml").write_text(OmegaConf.to_yaml(node))
     run_training(validate(TrainConfig, node), run)
-    from physai.artifact import export_policy  # it takes a second to import, which few tests need
+    from physai.artifact import export  # it takes a second to import, which few tests need
 
-    export_policy(run, "best", ["torchscript", "onnx"])
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(export, "TRANSFER_EPISODES", 100)
+        export.export_policy(run, "best", ["torchscript", "onnx"], episodes=100)
 
 
 @pytest.fixture(scope="session")
