@@ -337,13 +337,13 @@ def test_the_other_commands_refuse_in_one_line_too(run, copied, module, argument
     assert len(error.strip().splitlines()) == 1, error
 
 
-SHORT = ("env=reacher", "env.task.max_steps=40")  # pictures take their time
+SHORT = ("env=reacher", "env.task.max_steps=20")  # pictures take their time
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "magic", "env"), [("arm.gif", b"GIF89a", SHORT), ("arm.mp4", b"ftyp", ())])
-def test_play_writes_a_video(run, copied, tmp_path, name, magic, env):
-    code, output, error = run("play", "run=run", f"output={name}", "goals=1", *env)
+def test_play_writes_a_video(run, exported_run, tmp_path, name, magic, env):
+    code, output, error = run("play", f"run={exported_run}", f"output={name}", "goals=1", *env)
     assert code == 0, error
     assert magic in (tmp_path / name).read_bytes()[:16]
     assert f"Video: {name}" in output

@@ -54,11 +54,12 @@ def test_frames_are_those_of_processes_without_ray_and_go_on_bit_for_bit(cluster
         parts.assert_equal(ours.exclude("collector"), theirs)
         learn(theirs, other, statistics)
 
-    os.kill(min(working(cluster[1])), signal.SIGKILL)
+    workers = working(cluster[1])
+    os.kill(min(workers), signal.SIGKILL)
     with pytest.raises(UserError, match=r"a process that collects has ended \("):
         next(batches)
     again.shutdown()
-    assert cluster[1].poll() is None
+    assert all_gone(workers)
 
 
 @pytest.fixture(scope="module")
