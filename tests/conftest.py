@@ -43,8 +43,9 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     for item in items:
-        if not {"position_run", "recurrent_run", "small_run"}.isdisjoint(getattr(item, "fixturenames", ())):
-            item.add_marker(pytest.mark.slow)  # a run of their own is made for them
+        made = {"position_run", "recurrent_run", "small_run"}.intersection(getattr(item, "fixturenames", ()))
+        if made or item.get_closest_marker("realtime"):  # a run of their own is made for them; or they run apart
+            item.add_marker(pytest.mark.slow)
     if (chosen := config.getoption("--realtime")) is None:
         return
     wanted = [item for item in items if (item.get_closest_marker("realtime") is not None) == (chosen == "only")]

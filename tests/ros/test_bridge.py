@@ -100,6 +100,7 @@ def test_an_episode_over_ros_is_the_episode_in_process(start_robot, make):
     theirs.close()
 
 
+@pytest.mark.slow
 def test_without_rclpy_one_line_says_what_to_install():
     done = in_fresh_python(
         WITHOUT_ROS + "import gymnasium, physai\n"
