@@ -152,7 +152,7 @@ def test_a_policy_reaches_the_same_goals_over_ros_as_in_process(start, start_rob
     start_robot()
     here = ["env=reacher", "env.start.spread=[0.0,0.0]", "randomization=none"]
     for arguments in (["env=ros_reacher"], here):
-        command = start.run(evaluate(f"run={run}", "episodes=15", *arguments))
+        command = start.run(evaluate(f"run={run}", "episodes=15", "in_a_row=0", *arguments))
         assert command.wait(280.0) == 0, command.output
     over_ros, in_process = (
         json.loads((run / f"evaluation_{name}_none.json").read_text()) for name in ("ros_reacher", "reacher")
