@@ -120,6 +120,7 @@ def test_what_is_asked_of_single_rows(make):
             refused()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["DEFAULTS", "TUNED", "TUNED_WITH_FEATURES"])
 def test_stable_baselines3_learns_batch_by_batch(name):
     settings = getattr(sb3, name)
