@@ -46,8 +46,9 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     for item in items:
-        if not {"position_run", "recurrent_run", "small_run"}.isdisjoint(getattr(item, "fixturenames", ())):
-            item.add_marker(pytest.mark.slow)  # a run of their own is made for them
+        made = {"position_run", "recurrent_run", "small_run"}.intersection(getattr(item, "fixturenames", ()))
+        if made or item.get_closest_marker("realtime"):  # a run of their own is made for them; or they run apart
+            item.add_marker(pytest.mark.slow)
     if (chosen := config.getoption("--realtime")) is None:
         return
     wanted = [item for item in items if (item.get_closest_marker("realtime") is not None) == (chosen == "only")]
@@ -160,9 +161,11 @@ def _train_and_export(*arguments: Any) -> None:
     (run / ".hydra").mkdir()
     (run / ".hydra" / "config.yaml").write_text(OmegaConf.to_yaml(node))
     run_training(validate(TrainConfig, node), run)
-    from physai.artifact import export_policy  # it takes a second to import, which few tests need
+    from physai.artifact import export  # it takes a second to import, which few tests need
 
-    export_policy(run, "best", ["torchscript", "onnx"])
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(export, "TRANSFER_EPISODES", 100)
+        export.export_policy(run, "best", ["torchscript", "onnx"], episodes=100)
 
 
 @pytest.fixture(scope="session")

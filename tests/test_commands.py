@@ -11,7 +11,7 @@ from hydra.experimental.callback import Callback
 from omegaconf import OmegaConf
 
 from physai.compose import compose
-from tests.training.small import SMALL, command
+from tests.training.small import SMALL, TINY, command
 
 ROOT = Path(__file__).parent.parent
 
@@ -185,9 +185,9 @@ class Heard(Callback):
 def test_a_run_leaves_hydras_files_and_tells_its_callbacks(run, tmp_path):
     Heard.events.clear()
     callback = f"+hydra.callbacks.heard._target_={__name__}.Heard"
-    assert run("train", *SMALL, "seed=3", "hydra.run.dir=here", callback)[0] == 0
+    assert run("train", *TINY, "seed=3", "hydra.run.dir=here", callback)[0] == 0
     assert Heard.events == ["on_run_start", "on_job_start", "on_job_end", "on_run_end"]
-    assert OmegaConf.load(tmp_path / "here/.hydra/overrides.yaml") == [*SMALL, "seed=3"]
+    assert OmegaConf.load(tmp_path / "here/.hydra/overrides.yaml") == [*TINY, "seed=3"]
     assert OmegaConf.load(tmp_path / "here/.hydra/config.yaml").seed == 3
     hydra = OmegaConf.load(tmp_path / "here/.hydra/hydra.yaml").hydra
     assert hydra.mode == "RUN"
@@ -224,7 +224,7 @@ def test_a_second_sweep_does_not_overwrite_the_first(run, copied, tmp_path):
 
 @pytest.mark.slow
 def test_evaluate_says_how_sure_it_is_and_which_randomization_it_used(run, copied):
-    code, output, _ = run("evaluate", "run=run", "episodes=50", "randomization=strong")
+    code, output, _ = run("evaluate", "run=run", "episodes=50", "in_a_row=1", "randomization=strong")
     assert code == 0
     assert "95 % interval" in output
     assert "strong" in output
@@ -234,7 +234,8 @@ def test_evaluate_says_how_sure_it_is_and_which_randomization_it_used(run, copie
 
 
 def test_evaluate_drives_another_env_and_names_its_file_after_it(run, copied):
-    code, _, error = run("evaluate", "run=run", "episodes=20", "env=reacher", "env.start.spread=[0.0,0.0]")
+    sizes = ("episodes=20", "in_a_row=0")
+    code, _, error = run("evaluate", "run=run", *sizes, "env=reacher", "env.start.spread=[0.0,0.0]")
     assert code == 0, error
     result = json.loads((copied / "evaluation_reacher_default.json").read_text())
     assert (result["env"], result["randomization"], result["episodes"]) == ("reacher", "default", 20)
@@ -242,12 +243,13 @@ def test_evaluate_drives_another_env_and_names_its_file_after_it(run, copied):
 
 @pytest.mark.parametrize("env", [[], ["env=reacher"]], ids=["the run's env", "an env"])
 def test_evaluate_judges_a_policy_in_another_engine_and_names_its_file_after_it(run, copied, env):
-    code, _, error = run("evaluate", "run=run", "episodes=100", "physics=mujoco", "physics.motor=servo", *env)
+    sizes = ("episodes=20", "in_a_row=0")
+    code, _, error = run("evaluate", "run=run", *sizes, "physics=mujoco", "physics.motor=servo", *env)
     assert code == 0, error
     name = "_".join(["evaluation", *("reacher" for _ in env), "mujoco", "default"])
     result = json.loads((copied / f"{name}.json").read_text())
     assert result["physics"]["motor"] == "servo"
-    assert result["episodes"] == 100
+    assert result["episodes"] == 20
 
 
 def test_an_env_that_is_chosen_stays_in_the_run_s_engine(run, copied):
@@ -255,7 +257,7 @@ def test_an_env_that_is_chosen_stays_in_the_run_s_engine(run, copied):
     node = OmegaConf.load(config)
     node.physics = compose("train", ["physics=mujoco"]).physics
     OmegaConf.save(node, config)
-    code, _, error = run("evaluate", "run=run", "episodes=20", "env=reacher")
+    code, _, error = run("evaluate", "run=run", "episodes=20", "in_a_row=0", "env=reacher")
     assert code == 0, error
     result = json.loads((copied / "evaluation_reacher_default.json").read_text())
     assert result["physics"]["_target_"] == "physai.physics.mujoco.MuJoCoPhysics"
@@ -311,13 +313,13 @@ def test_the_other_commands_refuse_in_one_line_too(run, copied, module, argument
     assert len(error.strip().splitlines()) == 1, error
 
 
-SHORT = ("env=reacher", "env.task.max_steps=40")  # pictures take their time
+SHORT = ("env=reacher", "env.task.max_steps=20")  # pictures take their time
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "magic", "env"), [("arm.gif", b"GIF89a", SHORT), ("arm.mp4", b"ftyp", ())])
-def test_play_writes_a_video(run, copied, tmp_path, name, magic, env):
-    code, output, error = run("play", "run=run", f"output={name}", "goals=1", *env)
+def test_play_writes_a_video(run, exported_run, tmp_path, name, magic, env):
+    code, output, error = run("play", f"run={exported_run}", f"output={name}", "goals=1", *env)
     assert code == 0, error
     assert magic in (tmp_path / name).read_bytes()[:16]
     assert f"Video: {name}" in output
@@ -348,7 +350,7 @@ def test_help_shows_examples_and_every_value(run, module):
 @pytest.mark.slow
 def test_a_sweep_ends_with_a_table_of_all_runs_and_a_failure_stands_out(tmp_path):
     # a rate of 5e38 passes every check and explodes at the first update
-    arguments = ["-m", *SMALL, "algo.optimizer.lr=1e-3,5e38", "hydra.sweep.dir=sweep"]
+    arguments = ["-m", *TINY, "algo.optimizer.lr=1e-3,5e38", "hydra.sweep.dir=sweep"]
     process = command("train", *arguments, cwd=tmp_path)
     output = process.communicate()[0]
     assert process.returncode == 1

@@ -1,6 +1,7 @@
 """Every file in ``conf/`` composes into a valid config; walking the folders tests what is added."""
 
 import os
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -21,6 +22,7 @@ def choices(group: str) -> list[str]:
     return sorted(path.stem for path in (Path(conf_dir()) / group).glob("*.yaml"))
 
 
+@cache
 def algorithm_of(policy: str) -> str:
     """The first algorithm that brings these networks along; PPO takes the others."""
     for name in choices("algo"):
@@ -29,12 +31,16 @@ def algorithm_of(policy: str) -> str:
     return "algo=ppo"
 
 
+@cache
 def env_of(robot: str) -> str:
     """The first environment that has this robot; the reacher's takes others."""
     for name in choices("env"):
         if compose("train", [f"env={name}"], hydra=True).hydra.runtime.choices["robot@env.robot"] == robot:
             return f"env={name}"
     return "env=reacher"
+
+
+BESIDE = {"policy": algorithm_of, "robot@env.robot": env_of}  # what a choice of these is made with
 
 
 def small(*overrides: str) -> TrainConfig:
@@ -45,16 +51,17 @@ def small(*overrides: str) -> TrainConfig:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "overrides",
-    [[f"{group}={name}"] for group in ("env", "algo", "randomization", "logger") for name in choices(group)]
-    + [[algorithm_of(name), f"policy={name}"] for name in choices("policy")]
-    + [[env_of(name), f"robot@env.robot={name}"] for name in choices("robot")]
-    + [[f"task@env.task={name}"] for name in choices("task")]
-    + [[f"experiment={name}"] for name in choices("experiment")],
-    ids=lambda overrides: overrides[-1],
+    "override",
+    [
+        f"{group}={name}"
+        for group in (*BESIDE, "env", "algo", "randomization", "logger", "task@env.task", "experiment")
+        for name in choices(group.partition("@")[0])
+    ],
 )
-def test_every_choice_builds_and_collects(overrides):
-    config = small(*overrides)
+def test_every_choice_builds_and_collects(override):
+    group, name = override.split("=")
+    beside = [BESIDE[group](name)] if group in BESIDE else []
+    config = small(*beside, override)
     if not config.env.simulated:
         with pytest.raises(UserError, match="a policy is trained on simulated robots"):
             Agent.build(config)

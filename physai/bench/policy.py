@@ -59,7 +59,8 @@ def measure_policy(seed: int) -> tuple[dict[str, np.ndarray], float]:
 def make_run(run: Path, seed: int, formats: list[str], *overrides: str) -> None:
     """Train a little, and export the policy in these formats; how good it is does not matter here."""
     print(f"Exporting a policy that has seen {FRAMES:,} frames; how good it is does not matter ...", flush=True)
-    train_run(run, seed, f"total_frames={FRAMES}", "evaluation.episodes=100", *overrides)
+    sizes = (f"total_frames={FRAMES}", "evaluation.episodes=100", "evaluation.in_a_row=0")
+    train_run(run, seed, *sizes, *overrides)
     export_policy(run, "best", formats, episodes=10)
 
 

@@ -69,7 +69,7 @@ def test_a_run_that_requires_transfer_gets_no_file_where_arms_differ(required, m
     monkeypatch.setattr(transfer, "other_engine", lambda _: physics)
     monkeypatch.setattr(module, "TRANSFER_EPISODES", 50)
     with pytest.raises(gate.GateError, match="the motor of joint1 has less effort"):
-        export_policy(run, "best", ["torchscript"], config=config)
+        export_policy(run, "best", ["torchscript"], episodes=8, config=config)
     assert not list(run.glob("policy.*"))
 
 
@@ -117,15 +117,16 @@ def test_files_and_summary_say_how_the_policy_drives_in_the_other_engine(require
     assert summary["frames"] > 100_000
 
 
+@pytest.mark.slow
 def test_without_the_other_engine_a_run_that_requires_it_stops_and_others_are_told(required, monkeypatch):
     run, config = required
     monkeypatch.setattr(transfer.importlib.util, "find_spec", lambda name: None)
     with pytest.raises(UserError, match=r"the other engine needs 'mujoco', .*: pip install 'physai\[mujoco\]'"):
         transfer.other_engine(config.env.physics)
     with pytest.raises(gate.GateError, match=r"export\.transfer=require: the other engine needs 'mujoco'"):
-        export_policy(run, "best", ["torchscript"], config=config)
+        export_policy(run, "best", ["torchscript"], episodes=8, config=config)
     assert not list(run.glob("policy.*"))
     told = {}
-    export_policy(run, "best", ["torchscript"], told.__setitem__, config=load_config(run))
+    export_policy(run, "best", ["torchscript"], told.__setitem__, episodes=8, config=load_config(run))
     assert told["drives in the other engine"].startswith("not asked: the other engine needs 'mujoco'")
     assert (run / "policy.pt").is_file()

@@ -32,11 +32,11 @@ def test_algorithms_race(monkeypatch):
     monkeypatch.setattr(algorithms, "GOALS", 20)
     monkeypatch.setattr("physai.bench.training.JUDGE_EVERY", 256)
     reacher = algorithms.reacher
-    short = ("env.task.max_steps=10", "total_frames=2560")
+    short = ("env.task.max_steps=10", "total_frames=1280")
     monkeypatch.setattr(algorithms, "reacher", lambda seed, *overrides: reacher(seed, *overrides, *short))
     races = algorithms.measure_algorithms(seed=0, peer_seconds=0.1)
     assert list(races) == ["a2c", "td3"]
     for ours, theirs in races.values():
-        assert ours.frames >= 2560
+        assert ours.frames >= 1280
         assert theirs.frames >= 256
         assert min(ours.seconds, theirs.seconds) > 0

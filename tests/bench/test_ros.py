@@ -3,13 +3,15 @@
 import pytest
 from rich.console import Console
 
+from physai.artifact import export
 from physai.bench import policy, ros
 from tests.ros.peer import free_domain
 
 
 @pytest.mark.slow
 def test_both_nodes_are_timed_and_shown(monkeypatch):
-    monkeypatch.setattr(policy, "FRAMES", 4096)
+    monkeypatch.setattr(policy, "FRAMES", 2048)
+    monkeypatch.setattr(export, "TRANSFER_EPISODES", 8)
     monkeypatch.setattr(ros, "PERIOD_SECONDS", 2.0)
     monkeypatch.setattr(ros, "LATENCY_SECONDS", 1.0)
     monkeypatch.setattr(ros, "STARTS", 1)

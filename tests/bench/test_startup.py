@@ -5,14 +5,14 @@ from rich.console import Console
 
 from physai.bench import startup
 from physai.errors import UserError
-from tests.training.small import SMALL
+from tests.training.small import TINY
 
 
 @pytest.mark.slow
 def test_every_wait_is_measured_and_shown(monkeypatch):
     monkeypatch.setattr(startup, "ROUNDS", 1)
     monkeypatch.setattr(startup, "EPISODES", 20)
-    monkeypatch.setattr(startup, "TRAINING", SMALL)
+    monkeypatch.setattr(startup, "TRAINING", TINY)
     seconds = startup.measure_startup(seed=0)
     libraries, package, explained, first_frame, build, passed = (value for (value,) in seconds.values())
     assert package < libraries  # importing physai imports none of them

@@ -1,4 +1,5 @@
 import os
+import signal
 import socket
 import subprocess
 import sys
@@ -8,9 +9,10 @@ from pathlib import Path
 import pytest
 import torch
 
+from physai.errors import UserError
 from tests.collectors import parts
 from tests.training.processes import all_gone, command_of, descendants
-from tests.training.small import SMALL, command
+from tests.training.small import TINY, command
 
 pytest.importorskip("ray")
 pytestmark = [
@@ -26,9 +28,9 @@ def learn(batch, policy, normalization):
             parameter.add_(0.1)
 
 
-def test_frames_are_those_of_processes_without_ray_and_go_on_bit_for_bit(collect):
-    """With random frames, and with weights and statistics that change."""
-    before = descendants(os.getpid())
+def test_frames_are_those_of_processes_without_ray_and_go_on_bit_for_bit(cluster, collect, monkeypatch):
+    """With random frames, and with weights and statistics that change; a worker that is killed is one line."""
+    monkeypatch.setitem(parts.KINDS["ray"], "ray_init", parts.RAY | {"address": cluster[0]})
     plain, *learner = collect("multi_sync", warmup=128)
     expected = []
     for _, batch in zip(range(4), plain, strict=False):
@@ -41,25 +43,35 @@ def test_frames_are_those_of_processes_without_ray_and_go_on_bit_for_bit(collect
         parts.assert_equal(ours.exclude("collector"), theirs)
         learn(theirs, policy, normalization)
     state = source.state()
-    started = descendants(os.getpid()) - before
-    assert any("raylet" in command_of(process) for process in started)
     source.shutdown()
-    assert all_gone(started)
 
     again, other, statistics = collect("ray", seed=99)
     again.set_state(state)
     other.load_state_dict(policy.state_dict())
     statistics.load_state_dict(normalization.state_dict())
-    for ours, theirs in zip(expected[2:], again, strict=False):
+    batches = iter(again)
+    for ours, theirs in zip(expected[2:], batches, strict=False):
         parts.assert_equal(ours.exclude("collector"), theirs)
         learn(theirs, other, statistics)
 
+    workers = working(cluster[1])
+    os.kill(min(workers), signal.SIGKILL)
+    with pytest.raises(UserError, match=r"a process that collects has ended \("):
+        next(batches)
+    again.shutdown()
+    assert all_gone(workers)
 
-@pytest.fixture
-def cluster(monkeypatch):
+
+@pytest.fixture(scope="module")
+def cluster():
     """A Ray that is there already; its address and its process."""
-    monkeypatch.setenv("RAY_AUTH_MODE", "disabled")
-    monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("RAY_AUTH_MODE", "disabled")
+        patch.setenv("RAY_USAGE_STATS_ENABLED", "0")
+        yield from _cluster()
+
+
+def _cluster():
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         address = f"127.0.0.1:{free.getsockname()[1]}"
@@ -83,14 +95,18 @@ def cluster(monkeypatch):
     assert all_gone(started)
 
 
+def working(head):
+    """The processes of a cluster that step robots."""
+    return {one for one in descendants(head.pid) if "WorkerCollector" in command_of(one)}
+
+
 def test_a_cluster_that_is_there_is_joined_and_left_as_it_was(cluster, tmp_path):
     address, head = cluster
     joining = ["collector=ray", f"collector.ray_init.address={address}", "collector.num_envs=16"]
-    sizes = ["collector.frames_per_batch=1024", "total_frames=2048", "hydra.run.dir=run"]
-    process = command("train", *SMALL, *joining, *sizes, cwd=tmp_path)
+    process = command("train", *TINY, *joining, "hydra.run.dir=run", cwd=tmp_path)
     workers = set()
     while process.poll() is None:
-        workers |= {one for one in descendants(head.pid) if "WorkerCollector" in command_of(one)}
+        workers |= working(head)
         assert not any("raylet" in command_of(one) for one in descendants(process.pid))
         time.sleep(0.1)
     assert process.returncode == 0, process.communicate()[0]

@@ -325,7 +325,7 @@ def simulate(policy, reacher, robots, seconds, randomization, seed, change=None)
 
 @pytest.mark.slow
 def test_no_robot_of_strong_randomization_is_said_not_to_follow(policy, reacher):
-    for controller in simulate(policy, reacher, 40, 15.0, "strong", seed=21):
+    for controller in simulate(policy, reacher, 25, 15.0, "strong", seed=21):
         counters = controller.snapshot()["counters"]
         assert counters["entered active"] >= 1
         assert not [name for name in counters if name.startswith(("faults", "holds", "states rejected"))], counters

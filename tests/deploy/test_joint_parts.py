@@ -123,6 +123,7 @@ def pursue(arm, goal, tell):
     ],
     ids=["both at once", "in turn", "with a finger", "now and then whole"],
 )
+@pytest.mark.slow
 @pytest.mark.fault("messages that name some of the joints")
 def test_an_arm_that_tells_of_its_joints_in_parts_reaches_its_goals_as_one_that_does_not(policy, tell):
     parts, whole = Arm(policy), Arm(policy)

@@ -10,7 +10,6 @@ import tomllib
 import yaml
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, OmegaConf
-from ray.scripts.scripts import cli
 
 from physai.bench.__main__ import _options
 from physai.capsules import CapsulesConfig
@@ -64,6 +63,8 @@ def check(words: Sequence[str]) -> None:
         case ["ros2", *rest]:
             _check_ros2(rest)
         case ["ray", name, *rest]:
+            from ray.scripts.scripts import cli  # it takes two seconds to import
+
             cli.commands[name].make_context(name, list(rest))
         case _:
             pytest.fail(f"nobody knows how to check {' '.join(words)}")

@@ -50,7 +50,8 @@ def test_a_misspelt_key_is_answered_as_shown():
 
 
 @pytest.mark.slow
-def test_an_export_says_what_is_shown(exported_run, tmp_path, capsys):
+def test_an_export_says_what_is_shown(exported_run, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("physai.artifact.export.TRANSFER_EPISODES", 8)
     (command,) = [command for command in CONSOLE if "physai.export" in command]
     run = shutil.copytree(exported_run, tmp_path / "run")
     export(run, "best", ["torchscript", "onnx"], load_config(run, []))

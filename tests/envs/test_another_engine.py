@@ -58,6 +58,7 @@ def test_the_torchrl_env_runs_on_it(make, randomization):
     check_env_specs(make(4, f"randomization={randomization}"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", ["joint_velocity", "joint_position"])
 def test_a_policy_is_evaluated_on_it(make, command):
     env = make(50, NONE, f"env.robot.command={command}", "env.start.spread=[3.1,1.0]")

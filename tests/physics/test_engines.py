@@ -7,6 +7,7 @@ from physai.physics import nominal_dynamics
 from tests.physics.moving import commands, dynamics, joints, one_of, reset_all, run, start, weak, wild
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", [dynamics, weak, "wild"])
 def test_a_robot_among_64_follows_what_it_follows_alone(spec, make, kind):
     random = np.random.default_rng(0)
@@ -73,6 +74,7 @@ def test_resetting_some_robots_leaves_the_others_bit_identical(spec, make):
         np.testing.assert_array_equal(value[kept], quiet.parameters()[key][kept])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 def test_a_restored_state_continues_bit_for_bit_in_a_fresh_instance(spec, make, seed):
     random = np.random.default_rng(seed)

@@ -17,6 +17,7 @@ def ready(*given):
     return validate(SearchConfig, compose("search", given)).search.ranges
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", READY)
 def test_every_choice_and_both_ends_of_every_ready_range_fit_their_algorithm(name):
     found = space.make_space(ready(f"algo={name}"))

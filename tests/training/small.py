@@ -6,6 +6,7 @@ import json
 import os
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +31,9 @@ SMALL = (
     "algo.minibatch_size=256",
     "export.formats=[]",  # which takes three times as long as all the rest
 )
+
+# Runs of which several processes step a share of the robots each.
+SIZES = (*SMALL, "collector.num_envs=64", "collector.frames_per_batch=1024", "env.task.max_steps=40")
 
 # Runs of two iterations, episodes of 20 steps: for tests of what starts them.
 TINY = (
@@ -77,6 +81,11 @@ def run_here(run: Path, *overrides: str) -> None:
     node = compose("train", overrides)
     (run / ".hydra" / "config.yaml").write_text(OmegaConf.to_yaml(node))
     run_training(validate(TrainConfig, node), run)
+
+
+def undisturbed(once: Callable[[str, Callable[[Path], None]], Path], collector: str) -> Path:
+    """A whole run of ``SIZES`` with a collector, made once; Ray's are those of ``multi_sync``."""
+    return once(f"undisturbed_{collector}", lambda at: run_here(at / "run", *SIZES, f"collector={collector}")) / "run"
 
 
 def train_here(config: TrainConfig, run: Path, resume: bool = False) -> Agent:

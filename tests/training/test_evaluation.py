@@ -101,8 +101,14 @@ def ideal():
     with_time.close()
 
 
-def test_who_touches_the_goal_and_leaves_it_again_has_success_and_has_not_settled(ideal):
-    stays, leaves = swinging(ideal, stays=True), swinging(ideal, stays=False)
+@pytest.fixture(scope="module")
+def swung(ideal):
+    """How an arm does that stays, and one that leaves again."""
+    return swinging(ideal, stays=True), swinging(ideal, stays=False)
+
+
+def test_who_touches_the_goal_and_leaves_it_again_has_success_and_has_not_settled(swung):
+    stays, leaves = swung
     assert stays.success_rate > 0.9
     assert leaves.success_rate > 0.9
     assert stays.settled_rate > 0.9
@@ -111,15 +117,15 @@ def test_who_touches_the_goal_and_leaves_it_again_has_success_and_has_not_settle
     assert low <= leaves.settled_rate <= high
 
 
-def test_watching_on_after_a_success_changes_nothing_of_what_came_before(ideal):
+def test_watching_on_after_a_success_changes_nothing_of_what_came_before(swung):
     # A robot whose episode is over in the sense of the task is judged there: steps, error and return are of its end.
-    leaves = swinging(ideal, stays=False)
+    leaves = swung[1]
     assert (leaves.length[leaves.success] < 300).all()
     assert (leaves.error[leaves.success] < 0.05).all()
 
 
-def test_jerky_commands_show_in_the_change_of_action_and_in_the_acceleration(ideal):
-    smooth, jerky = (swinging(ideal, stays).summary() for stays in (True, False))
+def test_jerky_commands_show_in_the_change_of_action_and_in_the_acceleration(swung):
+    smooth, jerky = (one.summary() for one in swung)
     for figure in ("action_change_p99", "acceleration_p99"):
         assert jerky[figure] > 5 * smooth[figure]
     assert jerky["action_change_p99"] == pytest.approx(2.0)  # from one end to the other

@@ -9,9 +9,8 @@ from importlib.util import find_spec
 import pytest
 
 from tests.training.processes import all_gone, command_of, descendants
-from tests.training.small import SMALL, assert_same_run, command, metrics, resume_here, run_here
+from tests.training.small import SIZES, assert_same_run, command, metrics, resume_here, undisturbed
 
-SIZES = (*SMALL, "collector.num_envs=64", "collector.frames_per_batch=1024", "env.task.max_steps=40")
 needs_ray = pytest.mark.skipif(find_spec("ray") is None, reason="needs ray")
 COLLECTORS = ("async", "multi_sync", "multi_async", pytest.param("ray", marks=needs_ray))
 WORKERS = {"async": 1}  # others have two
@@ -69,19 +68,19 @@ class Run:
 @pytest.mark.parametrize("collector", COLLECTORS)
 def test_a_run_goes_on_from_a_killed_worker_a_signal_to_all_processes_and_a_kill(once, tmp_path, collector):
     """Each ends all of its processes; then the run ends as one that nothing has disturbed, to the last bit."""
-    plain = "multi_sync" if collector == "ray" else collector  # whose runs are the same
-    undisturbed = once(f"undisturbed_{plain}", lambda path: run_here(path / "run", *SIZES, f"collector={plain}"))
     run = Run(tmp_path, collector)
 
-    run.start()
-    os.kill(min(run.workers), signal.SIGKILL)
-    killed = time.monotonic()
-    output = run.ends(2)
-    assert time.monotonic() - killed < 30
-    assert "Traceback" not in output
-    assert output.count("error: a process that collects has ended (") == 1
+    if collector != "ray":  # where Ray loses a worker, and a computer with one: tests/collectors
+        run.start()
+        os.kill(min(run.workers), signal.SIGKILL)
+        killed = time.monotonic()
+        output = run.ends(2)
+        assert time.monotonic() - killed < 30
+        assert "Traceback" not in output
+        assert output.count("error: a process that collects has ended (") == 1
 
     run.start()
+    assert any("raylet" in command_of(one) for one in run.everybody) == (collector == "ray")
     number = signal.SIGTERM if collector == "ray" else signal.SIGINT
     os.killpg(run.process.pid, number)
     assert "python -m physai.train resume=run" in run.ends(128 + number)
@@ -93,7 +92,7 @@ def test_a_run_goes_on_from_a_killed_worker_a_signal_to_all_processes_and_a_kill
     run.ends(-signal.SIGKILL)
 
     resume_here(run.path)
-    assert_same_run(run.path, undisturbed / "run")
+    assert_same_run(run.path, undisturbed(once, "multi_sync" if collector == "ray" else collector))
 
 
 @pytest.mark.parametrize(

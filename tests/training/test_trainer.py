@@ -122,9 +122,7 @@ def test_a_stopped_run_saves_says_how_to_go_on_and_goes_on(small_run, tmp_path, 
     assert process.returncode == code
     assert "python -m physai.train resume=run" in output
     assert len(list((tmp_path / "run" / "checkpoints").glob("0*.pt"))) == 2  # the start, and where it stopped
-    resumed = command("train", "resume=run", cwd=tmp_path)
-    output = resumed.communicate()[0]
-    assert resumed.returncode == 0, output
+    resume_here(tmp_path / "run")
     assert_same_run(tmp_path / "run", small_run)
 
 
