@@ -1,7 +1,7 @@
 """physai: the shortest trustworthy way from a simulated robot arm to a policy on a ROS 2 robot.
 
-Importing it registers ``physai/Reacher-v0``, ``physai/PandaReach-v0`` and so on with Gymnasium, where that is installed:
-an id for each file of ``conf/env``. It imports nothing heavy.
+Importing it registers an id for each file of ``conf/env`` with Gymnasium, where that is installed, such as
+``physai/Reacher-v0`` and ``physai/PandaReach-v0``. It imports nothing heavy.
 """
 
 import importlib.util

@@ -1,7 +1,7 @@
 """Every file in ``conf/`` composes into a valid config; walking the folders tests what is added."""
 
 import os
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 
 import pytest
@@ -32,15 +32,19 @@ def algorithm_of(policy: str) -> str:
 
 
 @cache
-def env_of(robot: str) -> str:
-    """The first environment that has this robot; the reacher's takes others."""
+def env_with(group: str, choice: str) -> str:
+    """The first environment that has this robot or task; the reacher's takes others."""
     for name in choices("env"):
-        if compose("train", [f"env={name}"], hydra=True).hydra.runtime.choices["robot@env.robot"] == robot:
+        if compose("train", [f"env={name}"], hydra=True).hydra.runtime.choices[group] == choice:
             return f"env={name}"
     return "env=reacher"
 
 
-BESIDE = {"policy": algorithm_of, "robot@env.robot": env_of}  # what a choice of these is made with
+BESIDE = {  # what a choice of these is made with
+    "policy": algorithm_of,
+    "robot@env.robot": partial(env_with, "robot@env.robot"),
+    "task@env.task": partial(env_with, "task@env.task"),
+}
 
 
 def small(*overrides: str) -> TrainConfig:
@@ -54,7 +58,7 @@ def small(*overrides: str) -> TrainConfig:
     "override",
     [
         f"{group}={name}"
-        for group in (*BESIDE, "env", "algo", "randomization", "logger", "task@env.task", "experiment")
+        for group in (*BESIDE, "env", "algo", "randomization", "logger", "experiment")
         for name in choices(group.partition("@")[0])
     ],
 )
@@ -77,7 +81,9 @@ def test_every_choice_builds_and_collects(override):
 @pytest.mark.parametrize("robot", choices("robot"))
 @pytest.mark.parametrize("command", ["joint_velocity", "joint_position"])
 def test_every_robot_can_be_driven_by_velocities_and_by_positions(robot, command):
-    agent = Agent.build(small(env_of(robot), f"robot@env.robot={robot}", f"env.robot.command={command}"))
+    agent = Agent.build(
+        small(env_with("robot@env.robot", robot), f"robot@env.robot={robot}", f"env.robot.command={command}")
+    )
     batch = next(iter(agent.collector))
     assert ("last_command" in batch.keys()) == (command == "joint_position")  # noqa: SIM118 (of a TensorDict)
     agent.algorithm.update(batch)

@@ -55,7 +55,7 @@ class StickFigure:
         return np.array(points)
 
     def show(self, joint_position: np.ndarray, goal: np.ndarray) -> np.ndarray:
-        """Show a pose [n], rad, and a goal in the plane [2] or in space [3 or 7], m; return [height, width, 3] uint8."""
+        """Show a pose [n], rad, and a goal, its position first [2, 3 or 7], m; return [height, width, 3] uint8."""
         self._arm.set_data_3d(*self.points(joint_position).T)
         x, y, z = [*goal.tolist(), 0.0][:3]
         self._goal.set_data_3d([x], [y], [z])

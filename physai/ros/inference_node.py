@@ -282,7 +282,8 @@ class InferenceNode(StoppableNode[InferenceConfig]):
         values["counters"]["watchdog silences"] = self._commands.silences
         goal = self._controller.policy.metadata.goal
         if unheard := goals.other_types(self, self._goal_topic, goal):
-            said = f"goals are a {goals.goal_type(goal).__name__} for this policy; unheard on {self._goal_topic}: {unheard}"
+            wanted = goals.goal_type(goal).__name__
+            said = f"goals of this policy are a {wanted}; unheard on {self._goal_topic}: {', '.join(unheard)}"
             values["goals of another type"] = said
             self.get_logger().warning(said, throttle_duration_sec=10.0)
         now = self.get_clock().now().to_msg()

@@ -92,7 +92,7 @@ class Task(Protocol):
         return self.region.sample(rows, generator)
 
     def clearance(self, joint_position: np.ndarray) -> np.ndarray | None:
-        """Return how far robots [N, n], rad, are from touching anything, m, [N]; None: the task does not look at that."""
+        """Return how far robots [N, n], rad, are from touching anything, m, [N]; None where that is not looked at."""
 
     @torch.no_grad()
     def error(self, state: RobotState, goal: np.ndarray) -> np.ndarray:

@@ -9,11 +9,11 @@ from torch import Tensor
 
 from physai.config import PositiveFloat
 from physai.robots import ForwardKinematics, RobotSpec, angle_between, quaternion_matrix, rotation_vector
-from physai.signals import Quantity, Region, Signal, Tolerance
+from physai.signals import Quantity, Signal, Tolerance
 from physai.tasks.interface import ObservationModule
-from physai.tasks.reach_position import Posture, goals_in, space_observation
+from physai.tasks.reach_position import Posture, space_observation
+from physai.tasks.reachable import made_reachable
 from physai.tasks.reaching import Reaching
-
 
 _KNOWN = 1024  # configurations in the policy file
 _BENT = 0.02  # m², by which a pose may be farther whose configuration is nearer to home
@@ -27,9 +27,9 @@ class ReachPoseObservation(ObservationModule):
     features come the rotation vector r from the end effector to the goal and J_ωᵀr, the direction in joint space that
     shortens it fastest.
 
-    Following these alone, arms get stuck at their joint limits: many poses need another way to bend. So the module holds
-    configurations and the poses that they lead to, and shows how far the joints are from the one whose pose is nearest
-    to the goal: where roughly to go, whatever was before.
+    Following these alone, arms get stuck at their joint limits: many poses need another way to bend. So the module
+    holds configurations and the poses that they lead to, and shows how far the joints are from the one whose pose is
+    nearest to the goal: where roughly to go, whatever was before.
 
     Args:
         spec: The robot.
@@ -134,14 +134,14 @@ class ReachPose(Reaching):
     ) -> None:
         tolerances = Tolerance("distance", "m", tolerance), Tolerance("angle", "rad", angle_tolerance)
         super().__init__(spec, tolerances, (1.0, angle_weight), **judging)
-        self._goals = goals_in(region, spec, kinematics, Quantity.POSE, self.surroundings)
-        self.region: Region = self._goals.region
+        self._goals = made_reachable(region, spec, kinematics, Quantity.POSE, self.surroundings)
+        self.region = self._goals.region
         low, high = (tuple(bound.tolist()) for bound in self.region.bounds)
         self.goal = Signal("goal", Quantity.POSE, (7,), low, high, ("x", "y", "z", "qx", "qy", "qz", "qw"), spec.base)
         known = self._goals.known(_KNOWN)
         self.module = ReachPoseObservation(spec, kinematics, tolerance, angle_tolerance, known)
-        low, high = self.region.bounds
-        seen = np.concatenate([low[:3], np.full(6, -1.0)]), np.concatenate([high[:3], np.ones(6)])
+        least, most = self.region.bounds
+        seen = np.concatenate([least[:3], np.full(6, -1.0)]), np.concatenate([most[:3], np.ones(6)])
         self.observation = space_observation(spec, kinematics, seen)
 
     def sample_goal(self, rows: int, generator: torch.Generator) -> np.ndarray:

@@ -13,16 +13,16 @@ from physai.errors import UserError
 from physai.robots import ForwardKinematics, RobotSpec
 from physai.signals import Ball, Box, Quantity, Region, Signal, Tolerance
 from physai.tasks.interface import ObservationModule
-from physai.tasks.reachable import ReachableGoals
+from physai.tasks.reachable import ReachableGoals, made_reachable
 from physai.tasks.reaching import Reaching
 
 
 class ReachPositionObservation(ObservationModule):
     """As :class:`physai.tasks.reach.ReachObservation`, in space.
 
-    The observation is ``[q, qd, ee, goal]``. Features are sine and cosine of the joints; the error e = goal - ee and Jᵀe,
-    once in units of the arm and once, saturated, in units of the tolerance; and how far each joint is from home, as a share
-    of half its range.
+    The observation is ``[q, qd, ee, goal]``. Features are sine and cosine of the joints; the error e = goal - ee and
+    Jᵀe, once in units of the arm and once, saturated, in units of the tolerance; and how far each joint is from home, as a
+    share of half its range.
 
     Args:
         spec: The robot.
@@ -112,8 +112,8 @@ class ReachPosition(Reaching):
         **judging: Any,
     ) -> None:
         super().__init__(spec, (Tolerance("distance", "m", tolerance),), (1.0,), **judging)
-        self._goals = goals_in(region, spec, kinematics, Quantity.POSITION, self.surroundings)
-        self.region: Region = getattr(self._goals, "region", self._goals)
+        self._goals = goals_in(region, spec, kinematics, self.surroundings)
+        self.region = self._goals.region if isinstance(self._goals, ReachableGoals) else self._goals
         low, high = (tuple(bound.tolist()) for bound in self.region.bounds)
         self.goal = Signal("goal", Quantity.POSITION, (3,), low, high, ("x", "y", "z"), spec.base)
         self.module = ReachPositionObservation(spec, kinematics, tolerance)
@@ -125,31 +125,25 @@ class ReachPosition(Reaching):
 
 
 def goals_in(
-    region: Any,
-    spec: RobotSpec,
-    kinematics: ForwardKinematics,
-    quantity: Quantity,
-    surroundings: CollisionModel | None,
+    region: Any, spec: RobotSpec, kinematics: ForwardKinematics, surroundings: CollisionModel | None
 ) -> Region | ReachableGoals:
-    """Return what draws goals in space.
+    """Return what draws positions in space.
 
     Args:
         region: A region of positions, or :class:`ReachableGoals`, partly made.
         spec: The robot.
         kinematics: Its forward kinematics.
-        quantity: What a goal is.
         surroundings: What the robot must not touch; None where that is not looked at.
 
     Raises:
-        UserError: If it is no such region, or part of it is beyond the robot's reach.
+        UserError: If it is no such region, or part of it is beyond the robot's reach, or may be in something.
     """
     if callable(region):
-        made: ReachableGoals = region(spec, kinematics, quantity, surroundings=surroundings)
-        return made
-    if quantity is not Quantity.POSITION or not isinstance(region, Box | Ball) or len(region.bounds[0]) != 3:
+        return made_reachable(region, spec, kinematics, Quantity.POSITION, surroundings)
+    if not isinstance(region, Box | Ball) or len(region.bounds[0]) != 3:
         raise UserError(
-            "env.task.region: a physai.tasks.ReachableGoals is needed (_partial_: true)"
-            + (", or a physai.signals.Box or Ball of three numbers" if quantity is Quantity.POSITION else "")
+            "env.task.region: a physai.signals.Box or Ball of three numbers is needed, or a "
+            "physai.tasks.ReachableGoals (_partial_: true)"
         )
     low, high = region.bounds
     floor = None if surroundings is None else surroundings.floor
@@ -159,14 +153,13 @@ def goals_in(
             "(_partial_: true) draws those that the arm reaches"
         )
     shoulder = kinematics.shoulder
-    nearest = np.linalg.norm(np.clip(shoulder, low, high) - shoulder)
     farthest = np.linalg.norm(np.maximum(np.abs(low - shoulder), np.abs(high - shoulder)))
     if isinstance(region, Ball):
         farthest = np.linalg.norm(np.array(region.center) - shoulder) + region.radius
     if farthest > kinematics.reach:
         raise UserError(
-            f"env.task.region: it is {nearest:.2f} to {farthest:.2f} m from the first joint of '{spec.name}', which "
-            f"reaches {kinematics.reach:.2f} m"
+            f"env.task.region: parts of it are {farthest:.2f} m from the first joint of '{spec.name}', which reaches "
+            f"{kinematics.reach:.2f} m"
         )
     return region
 

@@ -1,6 +1,7 @@
 """Goals of which is known that an arm reaches them: where its end effector is in configurations drawn at random."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import torch
@@ -83,7 +84,7 @@ class ReachableGoals:
         )
 
     def _allowed(self, configurations: np.ndarray, goals: np.ndarray) -> np.ndarray:
-        allowed = ((goals[:, :3] >= self._low) & (goals[:, :3] <= self._high)).all(axis=1)
+        allowed: np.ndarray = np.all((goals[:, :3] >= self._low) & (goals[:, :3] <= self._high), axis=1)
         if self._surroundings is not None:
             inside = allowed.nonzero()[0]
             allowed[inside] = (self._surroundings.distance(configurations[inside]) > 0).all(axis=1)
@@ -97,3 +98,21 @@ class ReachableGoals:
         linear, rotation, _ = self._kinematics.linearize_pose(torch.cos(joint_position), torch.sin(joint_position))
         quaternion = Rotation.from_matrix(rotation.double().numpy()).as_quat(canonical=True)
         return np.concatenate([linear[:, :, -1].double().numpy(), quaternion], axis=1)
+
+
+def made_reachable(
+    region: Any,
+    spec: RobotSpec,
+    kinematics: ForwardKinematics,
+    quantity: Quantity,
+    surroundings: CollisionModel | None,
+) -> ReachableGoals:
+    """Make what a config has made in part.
+
+    Raises:
+        UserError: If that is something else.
+    """
+    made = region(spec, kinematics, quantity, surroundings=surroundings) if callable(region) else None
+    if not isinstance(made, ReachableGoals):
+        raise UserError("env.task.region: a physai.tasks.ReachableGoals is needed (_partial_: true)")
+    return made

@@ -23,8 +23,8 @@ class Reaching(Task):
         success_ends: Whether success ends the episode; else a policy learns to stay there until time is up.
         settle: How long the end effector must stay there to succeed, s; with 0 touching the goal is enough.
         smoothness: Weight of what changes of the action cost: their mean over the joints, as a share of the action.
-        posture: Weight of what being away from ``rest`` costs, which is home: the mean over the joints of the square of the distance, as a
-            share of half the joint's range. It keeps an arm from winding up into its limits, goal after goal.
+        posture: Weight of what being away from ``rest`` costs, which is home: the mean over the joints of the square of
+            the distance, as a share of half the joint's range. It keeps an arm from winding up into its limits.
         collision: What touching itself, the floor or a box costs, which ends the episode; 0: nothing is looked at.
         safe_distance: Nearer than this, m, costs a share of ``collision`` in each step.
         floor: Its height in the base frame, m; None where there is none.

@@ -45,10 +45,21 @@ def policies(panda, tmp_path_factory):
     n = len(panda.joints)
     inputs = [
         of_joints(*names, panda.joints)
-        for names in (("joint_position", "joint_position"), ("joint_velocity", "joint_velocity"), ("goal", "joint_position"))
+        for names in (
+            ("joint_position", "joint_position"),
+            ("joint_velocity", "joint_velocity"),
+            ("goal", "joint_position"),
+        )
     ]
     outputs = [of_joints("joint_velocity_command", Quantity.JOINT_VELOCITY, panda.joints)]
-    parts = GoesStraight(), panda.joints, inputs, outputs, Bounds((-4.0,) * n, (4.0,) * n), [Tolerance("worst", "rad", 0.05)]
+    parts = (
+        GoesStraight(),
+        panda.joints,
+        inputs,
+        outputs,
+        Bounds((-4.0,) * n, (4.0,) * n),
+        [Tolerance("worst", "rad", 0.05)],
+    )
     loaded = []
     for collision in (panda.collision, None):
         path = tmp_path_factory.mktemp("policy") / "policy.pt"
@@ -65,7 +76,9 @@ def drive(policy, panda, config, ticks, seed=0, goals=None):
     for tick in range(ticks):
         goal = None
         if tick % 100 == 10:
-            goal = Goal(panda.sample(1, random)[0] if goals is None else goals[(tick // 100) % len(goals)], names=panda.joints)
+            goal = Goal(
+                panda.sample(1, random)[0] if goals is None else goals[(tick // 100) % len(goals)], names=panda.joints
+            )
         heard = JointState(panda.joints, state.joint_position[0], state.joint_velocity[0], stamp=tick * DT)
         command = controller.update(tick * DT, heard, goal)
         state = physics.step(np.zeros((1, 7)) if command.value is None else command.value[None])

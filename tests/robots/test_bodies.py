@@ -50,7 +50,8 @@ def two_links(folder, place=(0, 0, 0), turn=(0, 0, 0), com=(0, 0, 0), second=(0.
         '<limit lower="-1" upper="1" effort="5" velocity="3"/></joint>'
         f'<joint name="weld" type="fixed"><parent link="first"/><child link="welded"/>'
         f'<origin xyz="{text(place)}" rpy="{text(turn)}"/></joint>'
-        '<joint name="mount" type="fixed"><parent link="welded"/><child link="tip"/><origin xyz="0 0 0.1"/></joint></robot>'
+        '<joint name="mount" type="fixed"><parent link="welded"/><child link="tip"/><origin xyz="0 0 0.1"/></joint>'
+        "</robot>"
     )
     return path
 

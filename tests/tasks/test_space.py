@@ -164,7 +164,10 @@ def test_a_posture_away_from_home_costs_by_the_joint_s_range(simulate):
         (["panda_reach", "env.task.region.high=[1.5,0.4,0.7]"], r"reaches 1\.\d\d m"),
         (["panda_reach", "env.task.region.high=[0.1,0.4,0.7]"], "a box needs lower and upper bounds"),
         (["panda_reach", "env.task.region.low=[0.3,0.1]", "env.task.region.high=[0.5,0.2]"], "Ball of three numbers"),
-        (["panda_pose", "env.task.region.low=[3,3,3]", "env.task.region.high=[4,4,4]"], "only 0 lead, without touching anything, into the box"),
+        (
+            ["panda_pose", "env.task.region.low=[3,3,3]", "env.task.region.high=[4,4,4]"],
+            "only 0 lead, without touching anything, into the box",
+        ),
     ],
 )
 def test_regions_that_make_no_sense_are_one_line(env_config, overrides, line):
