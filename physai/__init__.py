@@ -1,7 +1,7 @@
 """physai: the shortest trustworthy way from a simulated robot arm to a policy on a ROS 2 robot.
 
 Importing it registers an id for each file of ``conf/env`` with Gymnasium, where that is installed, such as
-``physai/Reacher-v0`` and ``physai/PandaReach-v0``. It imports nothing heavy.
+``physai/PandaReach-v0``, and one with exchangeable goals, ``physai/PandaReachGoal-v0``. It imports nothing heavy.
 """
 
 import importlib.util
@@ -44,6 +44,8 @@ def _register() -> None:
             kwargs={"env": env},
             nondeterministic=env == "ros_reacher",  # in real time nothing moves twice in exactly the same way
         )
+        if env != "ros_reacher":
+            register(f"physai/{name}Goal-v0", entry_point="physai.envs.goal_env:GoalGymEnv", kwargs={"env": env})
 
 
 if importlib.util.find_spec("gymnasium") is not None:  # a robot that only runs policies may not have it

@@ -46,7 +46,9 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     for item in items:
-        made = {"position_run", "recurrent_run", "small_run"}.intersection(getattr(item, "fixturenames", ()))
+        made = {"panda_run", "position_run", "recurrent_run", "small_run"}.intersection(
+            getattr(item, "fixturenames", ())
+        )
         if made or item.get_closest_marker("realtime"):  # a run of their own is made for them; or they run apart
             item.add_marker(pytest.mark.slow)
     if (chosen := config.getoption("--realtime")) is None:
@@ -108,6 +110,12 @@ def kuka_reacher() -> EnvConfig:
     return _env_config("kuka_reacher")
 
 
+@pytest.fixture(scope="session", params=["reacher", "kuka_reacher"])
+def two_joint_env(request: pytest.FixtureRequest) -> EnvConfig:
+    """The environments whose arm drives two joints, in turn."""
+    return _env_config(request.param)
+
+
 @pytest.fixture(scope="session", params=_simulated_envs())
 def any_env(request: pytest.FixtureRequest) -> EnvConfig:
     """Each environment in turn."""
@@ -153,6 +161,12 @@ def position_run(once: Callable[[str, Callable[[Path], None]], Path]) -> Path:
 def recurrent_run(once: Callable[[str, Callable[[Path], None]], Path]) -> Path:
     """The same, of a policy that remembers."""
     return once("recurrent_run", partial(_train_and_export, "policy=gru", "total_frames=80_000"))
+
+
+@pytest.fixture(scope="session")
+def panda_run(once: Callable[[str, Callable[[Path], None]], Path]) -> Path:
+    """A run of a Panda whose goals are positions in space."""
+    return once("panda_run", partial(_train_and_export, "env=panda_reach", "physics=mujoco", "total_frames=160_000"))
 
 
 def _train_and_export(*arguments: Any) -> None:

@@ -34,12 +34,12 @@ def draw_drive(record: "Record", policy: Policy, output: Path) -> None:
         output: The PNG to write.
     """
     figure = Figure(figsize=(12, 5.4), layout="constrained")
-    grid = figure.add_gridspec(1, 2, width_ratios=[1, 1.25])
-    if len(policy.metadata.goal.labels) > 2 and policy.metadata.goal.quantity is not Quantity.JOINT_POSITION:
-        _draw_path_in_space(figure, figure.add_subplot(grid[0], projection="3d"), record, policy)
-    else:
-        _draw_path(figure, figure.add_subplot(grid[0]), record, policy)
-    _draw_errors(figure.add_subplot(grid[1]), record, policy)
+    goal, grid = policy.metadata.goal, figure.add_gridspec(1, 2, width_ratios=[1, 1.25])
+    in_space = goal.quantity in (Quantity.POSITION, Quantity.POSE) and goal.size > 2
+    where = figure.add_subplot(grid[0], projection="3d" if in_space else None)
+    over = figure.add_subplot(grid[1])
+    (_draw_path_in_space if in_space else _draw_path)(figure, where, record, policy)
+    _draw_errors(over, record, policy)
     figure.savefig(output, dpi=120)
 
 

@@ -16,6 +16,9 @@ from physai.tasks.reachable import made_reachable
 from physai.tasks.reaching import Reaching
 
 _KNOWN = 1024  # configurations in the policy file
+_ARM = 0.3  # m/rad, by which angles count beside lengths
+_DAMPING = 3e-3  # m²
+_NEWTON = 13  # steps; by then the inverse is exact for what the damping leaves
 _BENT = 0.02  # m², by which a pose may be farther whose configuration is nearer to home
 
 
@@ -25,7 +28,8 @@ class ReachPoseObservation(ObservationModule):
     The observation is ``[q, qd, ee, goal]``, where of a goal's orientation the first two columns of its rotation matrix
     are seen: they do not jump (Zhou et al., CVPR 2019), and are the same for a quaternion and its opposite. To the
     features come the rotation vector r from the end effector to the goal and J_ωᵀr, the direction in joint space that
-    shortens it fastest.
+    shortens it fastest; and the step that shortens both errors at once, by damped least squares (Nakamura and Hanafusa,
+    1986).
 
     Following these alone, arms get stuck at their joint limits: many poses need another way to bend. So the module
     holds configurations and the poses that they lead to, and shows how far the joints are from the one whose pose is
@@ -48,6 +52,7 @@ class ReachPoseObservation(ObservationModule):
         known: tuple[np.ndarray, np.ndarray],
     ) -> None:
         super().__init__()
+        self.arm, self.angular, self.newton = _ARM, _ARM / math.sqrt(2.0), _NEWTON  # TorchScript knows no constants
         configurations, poses = (torch.from_numpy(array).float() for array in known)
         self.configurations: Tensor
         self.places: Tensor
@@ -65,6 +70,12 @@ class ReachPoseObservation(ObservationModule):
         fine = [0.5 / tolerance] * 3 + [0.5 / angle_tolerance] * 3 + joints
         self.coarse: Tensor
         self.fine: Tensor
+        self.unit: Tensor
+        self.twice: Tensor
+        self.damping: Tensor
+        self.register_buffer("unit", torch.eye(6))
+        self.register_buffer("twice", 2.0 * torch.eye(6))
+        self.register_buffer("damping", _DAMPING * torch.eye(6))
         self.register_buffer("coarse", torch.tensor(coarse))
         self.register_buffer("fine", torch.tensor(fine))
         self.posture = Posture(spec)
@@ -73,7 +84,7 @@ class ReachPoseObservation(ObservationModule):
         """Map positions [N, n] rad, velocities [N, n] rad/s and goals [N, 7] to observation and features.
 
         Returns:
-            Observation [N, 2n + 12] and features [N, 9n + 12].
+            Observation [N, 2n + 12] and features [N, 11n + 12].
         """
         sine, cosine = torch.sin(joint_position), torch.cos(joint_position)
         linear, rotation, angular = self.kinematics.linearize_pose(cosine, sine)
@@ -87,7 +98,10 @@ class ReachPoseObservation(ObservationModule):
         columns = wanted[:, :, :2].transpose(1, 2).flatten(1)
         way = self.nearest(goal[:, :3], wanted) - joint_position
         observation = torch.cat([wrapped, joint_velocity, end_effector, goal[:, :3], columns], dim=1)
-        bends = torch.cat([sine, cosine, away, way, torch.tanh(4.0 * way)], dim=1)
+        step = self.least_squares(
+            torch.cat([jacobian, self.arm * angular], dim=1), torch.cat([error, self.arm * turn], dim=1)
+        )
+        bends = torch.cat([sine, cosine, away, way, torch.tanh(4.0 * way), step, torch.tanh(8.0 * step)], dim=1)
         features = torch.cat([bends, errors * self.coarse, torch.tanh(errors * self.fine)], dim=1)
         return observation, features
 
@@ -97,9 +111,20 @@ class ReachPoseObservation(ObservationModule):
         apart = self.lengths - 2.0 * torch.matmul(self._place(position, rotation), self.places)
         return self.configurations[apart.argmin(dim=1)]
 
+    def least_squares(self, jacobian: Tensor, error: Tensor) -> Tensor:
+        """Map Jacobians [N, 6, n] and errors [N, 6] to the joints' way Jᵀ(JJᵀ + λ)⁻¹e, rad, [N, n].
+
+        The inverse is found by Newton's method (Schulz, 1933): of products alone, which every form of a policy has.
+        """
+        square = torch.bmm(jacobian, jacobian.transpose(1, 2)) + self.damping
+        inverse = self.unit / square.abs().sum(dim=2).amax(dim=1).unsqueeze(1).unsqueeze(2)
+        for _ in range(self.newton):
+            inverse = torch.bmm(inverse, self.twice - torch.bmm(square, inverse))
+        return torch.bmm(torch.bmm(error.unsqueeze(1), inverse), jacobian).squeeze(1)
+
     def _place(self, position: Tensor, rotation: Tensor) -> Tensor:
-        """Poses as points, whose distance is that of the positions and of the angles, at 0.3 m/rad."""
-        return torch.cat([position, 0.21 * rotation.flatten(1)], dim=1)
+        """Poses as points, whose distance is that of the positions and of the angles."""
+        return torch.cat([position, self.angular * rotation.flatten(1)], dim=1)
 
     @torch.jit.export
     def error(self, joint_position: Tensor, goal: Tensor) -> Tensor:

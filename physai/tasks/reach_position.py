@@ -21,8 +21,8 @@ class ReachPositionObservation(ObservationModule):
     """As :class:`physai.tasks.reach.ReachObservation`, in space.
 
     The observation is ``[q, qd, ee, goal]``. Features are sine and cosine of the joints; the error e = goal - ee and
-    Jᵀe, once in units of the arm and once, saturated, in units of the tolerance; and how far each joint is from home, as a
-    share of half its range.
+    Jᵀe, once in units of the arm and once, saturated, in units of the tolerance; and how far each joint is from home,
+    as a share of half its range.
 
     Args:
         spec: The robot.

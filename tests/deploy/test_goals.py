@@ -1,3 +1,4 @@
+import dataclasses
 import math
 
 import numpy as np
@@ -7,6 +8,7 @@ from hypothesis import strategies as st
 
 from physai.deploy import Goal
 from physai.deploy.goals import GoalError, accept
+from physai.signals import Box, Quantity, Signal
 
 
 @pytest.fixture(scope="module")
@@ -90,3 +92,40 @@ def test_what_is_taken_lies_on_the_ring(metadata, position):
         except GoalError:
             continue
         assert 0.3 - 1.1e-6 <= math.hypot(*taken) <= 0.53 + 1.1e-6
+
+
+@pytest.fixture(scope="module")
+def of_poses(metadata):
+    """The same policy's metadata, as if its goals were poses within a metre."""
+    labels = ("x", "y", "z", "qx", "qy", "qz", "qw")
+    goal = Signal("goal", Quantity.POSE, (7,), labels=labels, frame="base")
+    region = Box((-1.0,) * 7, (1.0,) * 7)
+    return dataclasses.replace(metadata, inputs=(*metadata.inputs[:2], goal), region=region)
+
+
+TURN = np.array([0.5, -0.5, 0.5, -0.5])
+
+
+@pytest.mark.parametrize("factor", [1.0, -1.0, 1.05])
+def test_a_quaternion_is_normalized_and_its_opposite_is_the_same_goal(of_poses, factor):
+    taken, moved = accept(Goal([0.1, 0.2, 0.3, *(factor * TURN)], "base"), of_poses, False)
+    np.testing.assert_allclose(taken, [0.1, 0.2, 0.3, *-TURN])
+    assert not moved
+
+
+@pytest.mark.parametrize("turn", [[0.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 0.5], [9.0, 0.0, 0.0, 0.0]])
+def test_a_quaternion_that_is_no_rotation_is_rejected_with_its_length(of_poses, turn):
+    goal = Goal([0.1, 0.2, 0.3, *turn], "base")
+    assert rejection(goal, of_poses) == "not a rotation"
+    with pytest.raises(GoalError, match=f"its quaternion has the length {np.linalg.norm(turn):.3f}, not 1"):
+        accept(goal, of_poses, False)
+
+
+def test_a_position_is_no_pose(of_poses):
+    assert rejection(Goal([0.1, 0.2, 0.3], "base"), of_poses) == "malformed"
+
+
+def test_a_goal_inside_of_something_is_rejected_by_its_name(of_poses):
+    goal = Goal([0.1, 0.2, 0.3, *TURN], "base")
+    with pytest.raises(GoalError, match="goal rejected: it lies in 'shelf'"):
+        accept(goal, of_poses, False, lambda point: "shelf" if np.allclose(point, [0.1, 0.2, 0.3]) else None)

@@ -16,8 +16,8 @@ pytestmark = pytest.mark.parametrize("engine", ["pybullet", "impulse"], indirect
 
 
 @pytest.fixture(scope="module")
-def spec(any_env):
-    return dataclasses.replace(RobotSpec.from_config(any_env.robot), command=Quantity.JOINT_POSITION)
+def spec(two_joint_env):
+    return dataclasses.replace(RobotSpec.from_config(two_joint_env.robot), command=Quantity.JOINT_POSITION)
 
 
 @pytest.fixture

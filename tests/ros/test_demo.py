@@ -46,6 +46,17 @@ def test_a_policy_that_commands_positions_drives_an_arm_that_takes_them(start, p
 
 
 @pytest.mark.slow
+def test_an_arm_with_seven_joints_is_driven_to_points_in_space(start, panda_run, tmp_path):
+    picture = tmp_path / "path.png"
+    overrides = (f"policy_path={panda_run / 'policy.pt'}", f"output={picture}", "goals=3", "hold=1")
+    process = start.run(demo(*overrides))
+    assert process.wait(120) == 0, process.output
+    assert "drives a virtual panda" in process.output
+    assert "3 of 3 goals reached, and held for 1 s" in process.output
+    assert picture.is_file()
+
+
+@pytest.mark.slow
 def test_it_refuses_to_start_where_a_robot_is_already(start, policy_path):
     start("virtual_robot").says("takes joint_velocity")
     process = start.run(demo(f"policy_path={policy_path}"))

@@ -2,7 +2,7 @@
 
 import pytest
 from builtin_interfaces.msg import Time
-from geometry_msgs.msg import PointStamped
+from geometry_msgs.msg import PointStamped, PoseStamped
 from sensor_msgs.msg import JointState
 
 from physai.errors import UserError
@@ -11,12 +11,15 @@ from physai.signals import Quantity, Signal
 
 PLACE = Signal("goal", Quantity.POSITION, (3,), labels=("x", "y", "z"), frame="base")
 PLANE = Signal("goal", Quantity.POSITION, (2,), labels=("x", "y"), frame="base")
+POSE = Signal("goal", Quantity.POSE, (7,), labels=("x", "y", "z", "qx", "qy", "qz", "qw"), frame="base")
 JOINTS = Signal("goal", Quantity.JOINT_POSITION, (2,), labels=("a", "b"))
 
 
-@pytest.mark.parametrize("signal", [PLACE, PLANE, JOINTS], ids=["in space", "in the plane", "of joints"])
+@pytest.mark.parametrize(
+    "signal", [PLACE, PLANE, POSE, JOINTS], ids=["in space", "in the plane", "a pose", "of joints"]
+)
 def test_a_goal_comes_out_of_its_message_as_it_went_in(signal):
-    value = [0.1, -0.2, 0.3][: signal.size]
+    value = [0.1, -0.2, 0.3, 0.5, -0.5, 0.5, 0.5][: signal.size]
     message = goals.to_message(value, signal, Time(sec=7))
     assert message.header.stamp.sec == 7
     goal = goals.from_message(message, signal)
@@ -26,6 +29,7 @@ def test_a_goal_comes_out_of_its_message_as_it_went_in(signal):
 
 def test_the_type_of_a_message_follows_from_the_quantity():
     assert goals.goal_type(PLACE) is goals.goal_type(PLANE) is PointStamped
+    assert goals.goal_type(POSE) is PoseStamped
     assert goals.goal_type(JOINTS) is JointState
     with pytest.raises(UserError, match="the policy's goal is a joint_velocity: no ROS message"):
         goals.goal_type(Signal("goal", Quantity.JOINT_VELOCITY, (2,)))

@@ -9,10 +9,11 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from scipy import stats
 
-from physai.signals import Box, Ring
+from physai.signals import Ball, Box, Reachable, Ring
 from physai.signals.region import REGIONS
 
 RING = Ring(0.3, 0.53)
+KINDS = ["ring", "ball", "box", "reachable"]
 BOX = Box((-1.0, 0.0, 2.0), (1.0, 0.5, 2.0))
 
 numbers = st.floats(-1e6, 1e6)
@@ -28,6 +29,11 @@ def rings(draw):
 def boxes(draw):
     pairs = [sorted(pair) for pair in draw(st.lists(st.tuples(numbers, numbers), min_size=1, max_size=8))]
     return Box(*(tuple(side) for side in zip(*pairs, strict=True)))
+
+
+@st.composite
+def balls(draw):
+    return Ball(tuple(draw(st.lists(st.floats(-1e3, 1e3), min_size=3, max_size=3))), draw(st.floats(1e-3, 1e3)))
 
 
 def generator(seed=0):
@@ -50,7 +56,7 @@ def test_numbers_of_a_box_are_uniform_and_independent():
     assert (fixed == 2.0).all()
 
 
-@given(st.one_of(rings(), boxes()), st.integers(0, 2**32))
+@given(st.one_of(rings(), boxes(), balls()), st.integers(0, 2**32))
 def test_what_is_drawn_is_inside_and_within_the_bounds(region, seed):
     goals = region.sample(20, generator(seed))
     low, high = region.bounds
@@ -145,4 +151,45 @@ def test_a_box_without_bounds_is_refused(low, high):
 
 
 def test_a_policy_file_names_regions_by_their_kind():
-    assert {name: region.kind for name, region in REGIONS.items()} == {"ring": "ring", "box": "box"}
+    assert [(name, region.kind) for name, region in REGIONS.items()] == [(kind, kind) for kind in KINDS]
+
+
+def test_points_of_a_ball_are_uniform():
+    ball = Ball((0.5, -0.2, 0.4), 0.3)
+    away = ball.sample(5000, generator()) - np.array(ball.center)
+    radius = np.linalg.norm(away, axis=1)
+    assert stats.kstest((radius / 0.3) ** 3, "uniform").pvalue > 1e-3
+    assert stats.kstest(away[:, 2] / radius, stats.uniform(-1, 2).cdf).pvalue > 1e-3
+    assert np.abs(away.mean(axis=0)).max() < 0.01
+
+
+@given(balls(), st.lists(st.floats(-1e3, 1e3), min_size=3, max_size=3))
+def test_no_point_of_a_ball_is_nearer_than_the_projection(ball, point):
+    goal, projected = np.array(point), ball.project(np.array(point))
+    distance = np.linalg.norm(goal - np.array(ball.center))
+    assert ball.contains(projected) or ball.radius < 1e-2
+    assert np.linalg.norm(goal - projected) == pytest.approx(max(distance - ball.radius, 0.0), abs=1e-5)
+
+
+@pytest.mark.parametrize(("center", "radius"), [((0.0, 0.0), 1.0), ((0.0, 0.0, math.nan), 1.0), ((0.0, 0.0, 0.0), 0.0)])
+def test_a_ball_without_room_or_place_is_refused(center, radius):
+    with pytest.raises(ValueError, match="a ball needs a centre"):
+        Ball(center, radius)
+
+
+def test_examples_are_drawn_of_what_was_reached_and_its_bounds_say_what_else_may_be():
+    region = Reachable((0.0, 0.0), (1.0, 2.0), (0.1, 0.2, 0.9, 1.8))
+    drawn = region.sample(50, generator())
+    assert {tuple(goal) for goal in drawn} == {(0.1, 0.2), (0.9, 1.8)}
+    assert region.contains(np.array([0.5, 1.0]))
+    assert not region.contains(np.array([0.5, 2.1]))
+    np.testing.assert_array_equal(region.project(np.array([0.5, 2.1])), [0.5, 2.0])
+    assert "its number 2 is 2.100" in region.describe(np.array([0.5, 2.1]))
+
+
+@pytest.mark.parametrize(
+    ("examples", "line"), [((), "are no examples"), ((0.1, 0.2, 0.3), "are no examples"), ((0.1, 9.0), "not within")]
+)
+def test_examples_that_are_none_are_refused(examples, line):
+    with pytest.raises(ValueError, match=line):
+        Reachable((0.0, 0.0), (1.0, 2.0), examples)

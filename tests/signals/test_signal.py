@@ -56,4 +56,5 @@ def test_bounds_of_another_length_than_the_joints_are_refused():
 
 def test_units_follow_from_the_quantity():
     units = {quantity.value: Signal("x", quantity, (1,)).unit for quantity in Quantity}
-    assert units == {"joint_position": "rad", "joint_velocity": "rad/s", "position": "m", "memory": "", "view": ""}
+    of_joints = {"joint_position": "rad", "joint_velocity": "rad/s"}
+    assert units == {**of_joints, "position": "m", "pose": "", "memory": "", "view": ""}

@@ -20,7 +20,7 @@ def reach(config, goal_radius=RADII) -> Reach:
     """The task of an env's robot."""
     spec = RobotSpec.from_config(config.robot)
     rest = {"tolerance": 0.05, "success_reward": 10.0, "success_ends": True, "settle": 0.0, "max_steps": 200}
-    rest |= {"smoothness": 0.0, "posture": 0.0}
+    rest |= {"smoothness": 0.0, "posture": 0.0, "collision": 0.0, "safe_distance": 0.01, "floor": None, "boxes": []}
     return Reach(spec, ForwardKinematics(spec), goal_radius, **rest)
 
 

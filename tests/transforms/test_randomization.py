@@ -36,8 +36,8 @@ def normal(mean, std, operation="set"):
 
 
 @pytest.fixture(scope="module")
-def layout(any_env):
-    return ParameterLayout(RobotSpec.from_config(any_env.robot))
+def layout(two_joint_env):
+    return ParameterLayout(RobotSpec.from_config(two_joint_env.robot))
 
 
 @pytest.fixture
