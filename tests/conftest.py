@@ -116,6 +116,17 @@ def two_joint_env(request: pytest.FixtureRequest) -> EnvConfig:
     return _env_config(request.param)
 
 
+def _first_of_each_robot() -> list[str]:
+    robots = {_env_config(name).robot.name: name for name in reversed(_simulated_envs())}
+    return sorted(robots.values())
+
+
+@pytest.fixture(scope="session", params=_first_of_each_robot())
+def any_robot(request: pytest.FixtureRequest) -> EnvConfig:
+    """An environment of each robot in turn."""
+    return _env_config(request.param)
+
+
 @pytest.fixture(scope="session", params=_simulated_envs())
 def any_env(request: pytest.FixtureRequest) -> EnvConfig:
     """Each environment in turn."""

@@ -15,7 +15,7 @@ from physai.signals import Quantity, Reachable
 
 _POOL = 4096  # configurations
 _EXAMPLES = 256  # of them in the policy file
-_BATCHES = 200  # of as many as the pool holds are drawn at most
+_BATCHES = 50  # of as many as the pool holds are drawn at most
 _NEAR = 0.1  # rad, by which a joint of a drawn configuration may differ from that in the pool
 
 

@@ -125,6 +125,7 @@ def test_a_position_is_no_pose(of_poses):
     assert rejection(Goal([0.1, 0.2, 0.3], "base"), of_poses) == "malformed"
 
 
+@pytest.mark.fault("goal inside the robot's base, the floor or a box; quaternion that is no rotation")
 def test_a_goal_inside_of_something_is_rejected_by_its_name(of_poses):
     goal = Goal([0.1, 0.2, 0.3, *TURN], "base")
     with pytest.raises(GoalError, match="goal rejected: it lies in 'shelf'"):

@@ -108,6 +108,10 @@ def folded(panda):
     return samples[deepest]
 
 
+@pytest.mark.fault(
+    "a motion would bring two links within `collision_margin` (1 cm) of each other, of the floor or of a box, within "
+    "`stopping_time` (0.12 s)"
+)
 def test_what_it_holds_back_it_says_by_the_names_of_both_links_and_away_is_free(policies, panda):
     visited, controller = drive(policies[0], panda, {}, 110, goals=[folded(panda)])
     now = 110 * DT

@@ -14,9 +14,9 @@ from tests.physics.moving import DT
 
 
 @pytest.fixture(scope="module")
-def spec(any_env: EnvConfig) -> RobotSpec:
-    """The robot of each environment in turn."""
-    return RobotSpec.from_config(any_env.robot)
+def spec(any_robot: EnvConfig) -> RobotSpec:
+    """Each robot in turn."""
+    return RobotSpec.from_config(any_robot.robot)
 
 
 @pytest.fixture(scope="module")

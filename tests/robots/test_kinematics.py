@@ -21,8 +21,8 @@ SEVEN = [f"lbr_iiwa_joint_{number}" for number in range(1, 8)]
 
 
 @pytest.fixture(scope="module")
-def spec(any_env):
-    return RobotSpec.from_config(any_env.robot)
+def spec(any_robot):
+    return RobotSpec.from_config(any_robot.robot)
 
 
 def first_joints(config: RobotConfig, joints: int) -> RobotSpec:
