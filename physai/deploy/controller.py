@@ -62,20 +62,18 @@ class Controller:
         self._latch_reason = ""
         config = config or ControllerConfig()
         self._robot = JointReader(metadata, config)
-        self._progress = Progress()
-        self._strain = Strain(metadata)
+        self._progress, self._strain = Progress(), Strain(metadata)
         self.configure(config)
         self._now: float | None = None
         self._still = 0  # updates in a row at that time
         self._received = -math.inf  # when the robot was heard of: its joint that was not for longest
         self._goal: np.ndarray | None = None
-        self._reached = False
+        self._reached = self._guarded = False  # at the goal; held back by the collision guard
         self._memory = self._asked.nothing
         self._step = 0.0  # s since the memory's last one
         self._needed = 0  # good joint states until a hold ends
         self._hold_reason = ""
         self._gave_up = ""  # why this goal is not pursued any more
-        self._guarded = False  # whether the guard held the last motion back
         self._failures = 0  # of the policy, in a row
         self._command = Command(None, State.WAITING, ())
         self._since = 0.0
