@@ -36,15 +36,15 @@ def move(simulation, steps=10, seed=0):
 
 
 @pytest.mark.slow
-def test_starts_are_uniform_around_home_and_at_rest(simulate, any_env):
-    simulation = simulate(name=any_env.name, robots=500)
+def test_starts_are_uniform_around_home_and_at_rest(simulate, two_joint_env):
+    simulation = simulate(name=two_joint_env.name, robots=500)
     starts = []
     for _ in range(6):
         move(simulation, 1)
         simulation.reset()
         starts.append(simulation.state.joint_position)
         assert not simulation.state.joint_velocity.any()
-    spread, home = any_env.start.spread, simulation.spec.home
+    spread, home = two_joint_env.start.spread, simulation.spec.home
     for joint, width in enumerate(spread):
         column = np.concatenate(starts)[:, joint]
         assert stats.kstest(column, stats.uniform(home[joint] - width, 2 * width).cdf).pvalue > 1e-3

@@ -158,6 +158,30 @@ def test_a_posture_away_from_home_costs_by_the_joint_s_range(simulate):
     np.testing.assert_allclose(paid, -0.3 * (away**2).mean(axis=1), rtol=1e-5)
 
 
+def test_an_episode_that_would_begin_in_a_collision_begins_at_home(simulate):
+    simulation = simulate("panda_reach", "env.start.spread=[2.8,1.7,2.8,1.4,2.8,1.8,2.8]", "env.start.carried_over=0.0")
+    at_home = 0
+    for _ in range(10):
+        simulation.reset()
+        assert (simulation.task.clearance(simulation.state.joint_position) > 0).all()
+        at_home += (simulation.state.joint_position == simulation.spec.home).all(axis=1).sum()
+    assert 10 < at_home < 70
+
+
+def test_a_collision_ends_the_episode_and_costs(simulate):
+    simulation = simulate("panda_reach")
+    simulation.reset()
+    samples = simulation.spec.sample(500, np.random.default_rng(0))
+    touching = samples[simulation.task.clearance(samples) <= 0][:8]
+    simulation.physics.reset(np.arange(8), state_at(touching))
+    simulation.state = simulation.physics.robot_state()
+    _, terminated, _ = simulation.step(np.zeros((8, 7)))
+    assert terminated.all()
+    assert not simulation.success.any()
+    paid = simulation.episode_rewards[:, simulation.reward_terms.index("collision")]
+    np.testing.assert_allclose(paid, -20.0)
+
+
 @pytest.mark.parametrize(
     ("overrides", "line"),
     [
