@@ -4,6 +4,7 @@ import math
 import time
 
 import pytest
+from geometry_msgs.msg import PoseStamped
 
 from tests.ros.loop import FAR, closed_loop
 from tests.ros.peer import wait_for
@@ -40,6 +41,19 @@ def test_a_bad_goal_does_not_start_the_arm(loop):
         loop.peer.send_goal(*goal)
     loop.peer.all_zeros(after=since, commands=20)
     assert loop.diagnosis()[2]["goal"] == ""
+
+
+@pytest.mark.slow
+def test_goals_of_another_type_do_not_arrive_and_are_named(loop):
+    loop.rest()
+    poses = loop.peer.node.create_publisher(PoseStamped, "/inference_node/goal", 1)
+    said = "goals of this policy are a PointStamped; unheard on /inference_node/goal: geometry_msgs/msg/PoseStamped"
+    try:
+        wait_for(lambda: any(said in line and "WARN" in line for line in loop.node.lines), what=said)
+        wait_for(lambda: loop.diagnosis()[2].get("goals of another type") == said, what=said)
+    finally:
+        loop.peer.node.destroy_publisher(poses)
+    wait_for(lambda: "goals of another type" not in loop.diagnosis()[2], what="no publisher of poses")
 
 
 @pytest.mark.slow
