@@ -7,7 +7,7 @@ import pytest
 from geometry_msgs.msg import PoseStamped
 
 from tests.ros.loop import FAR, closed_loop
-from tests.ros.peer import wait_for
+from tests.ros.peer import Peer, wait_for
 
 BAD = {
     "of another frame": ((0.3, 0.3, "world"), "goal rejected: frame 'world' is not 'base'"),
@@ -46,13 +46,14 @@ def test_a_bad_goal_does_not_start_the_arm(loop):
 @pytest.mark.slow
 def test_goals_of_another_type_do_not_arrive_and_are_named(loop):
     loop.rest()
-    poses = loop.peer.node.create_publisher(PoseStamped, "/inference_node/goal", 1)
+    other = Peer(loop.peer.domain, listen_to_commands=False)  # one process cannot have a topic with two types
+    other.publisher(PoseStamped, "/inference_node/goal")
     said = "goals of this policy are a PointStamped; unheard on /inference_node/goal: geometry_msgs/msg/PoseStamped"
     try:
         wait_for(lambda: any(said in line and "WARN" in line for line in loop.node.lines), what=said)
         wait_for(lambda: loop.diagnosis()[2].get("goals of another type") == said, what=said)
     finally:
-        loop.peer.node.destroy_publisher(poses)
+        other.close()
     wait_for(lambda: "goals of another type" not in loop.diagnosis()[2], what="no publisher of poses")
 
 
