@@ -1,7 +1,15 @@
 """Actor and critic networks: TensorDict modules around plain ``torch.nn``."""
 
-from physai.policies.networks import Critic, GaussianActor, input_size
+from physai.policies.networks import Critic, GaussianActor, ResidualActor, input_size
 from physai.policies.recurrent import GRUActor
 from physai.policies.squashed import DeterministicActor, TanhGaussianActor
 
-__all__ = ["Critic", "DeterministicActor", "GRUActor", "GaussianActor", "TanhGaussianActor", "input_size"]
+__all__ = [
+    "Critic",
+    "DeterministicActor",
+    "GRUActor",
+    "GaussianActor",
+    "ResidualActor",
+    "TanhGaussianActor",
+    "input_size",
+]

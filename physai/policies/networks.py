@@ -99,12 +99,13 @@ class GaussianActor(TensorDictModuleBase):
     ) -> None:
         super().__init__()
         self.in_keys = in_keys
-        self.network = mlp(in_features, hidden_sizes, action_size, activation, last_gain=0.01)  # start near standstill
+        # It starts near standstill.
+        self.network: nn.Module = mlp(in_features, hidden_sizes, action_size, activation, last_gain=0.01)
         self.log_std = nn.Parameter(torch.full((action_size,), initial_std).log())
 
     def deterministic(self) -> nn.Module:
         """What acts without exploration, scriptable: ``in_keys`` side by side, [N, in_features], to actions [N, n]."""
-        return nn.Sequential(*self.network, nn.Tanh())
+        return nn.Sequential(self.network, nn.Tanh())
 
     def mean(self, tensordict: TensorDictBase) -> Tensor:
         """Mean of the latent action, [.., n]."""
@@ -126,6 +127,47 @@ class GaussianActor(TensorDictModuleBase):
         tensordict.set("action", torch.tanh(latent))
         tensordict.set("latent_action", latent)
         return tensordict.set("action_log_prob", log_prob)
+
+
+class ResidualActor(GaussianActor):
+    """A :class:`GaussianActor` that adds to what its task suggests (``suggests`` of its observation module).
+
+    After Johannink et al., "Residual Reinforcement Learning for Robot Control", ICRA 2019: the suggestion solves most
+    of the task, and the network learns the rest. The suggestion is the last n of the numbers that it sees, so
+    ``features`` are the last of its keys.
+
+    Args:
+        in_features: Numbers that ``in_keys`` bring.
+        action_size: n.
+        *args: Those of :class:`GaussianActor`, from ``in_keys`` on.
+        **kwargs: The same by name.
+    """
+
+    residual = True
+
+    def __init__(self, in_features: int, action_size: int, *args: Any, **kwargs: Any) -> None:
+        super().__init__(in_features, action_size, *args, **kwargs)
+        if self.in_keys[-1] != "features":
+            raise UserError("policy.actor.in_keys: the last must be features, which end with what the task suggests")
+        self.network = Residual(self.network, action_size)
+
+
+class Residual(nn.Module):
+    """Adds the last inputs to what a network makes of all of them.
+
+    Args:
+        network: Maps [.., in_features] to [.., size].
+        size: How many.
+    """
+
+    def __init__(self, network: nn.Module, size: int) -> None:
+        super().__init__()
+        self.network = network
+        self.size = size
+
+    def forward(self, seen: Tensor) -> Tensor:
+        """Map [.., in_features] to [.., size]."""
+        return self.network(seen) + seen[..., -self.size :]
 
 
 class Critic(TensorDictModuleBase):

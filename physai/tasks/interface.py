@@ -13,7 +13,14 @@ from physai.signals import Region, Signal, Tolerance
 
 
 class ObservationModule(nn.Module):
-    """From what a robot senses to what its policy sees; scriptable, and part of the exported policy."""
+    """From what a robot senses to what its policy sees; scriptable, and part of the exported policy.
+
+    Attributes:
+        suggests: Whether the last n features are the latent actions of a controller without learning, to which a
+            :class:`physai.policies.ResidualActor` adds.
+    """
+
+    suggests: bool = False
 
     def forward(self, joint_position: Tensor, joint_velocity: Tensor, goal: Tensor) -> tuple[Tensor, Tensor]:
         """Map positions [N, n] rad, velocities [N, n] rad/s and goals [N, g] to observation and features.

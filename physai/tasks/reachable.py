@@ -13,10 +13,9 @@ from physai.errors import UserError
 from physai.robots import ForwardKinematics, RobotSpec
 from physai.signals import Quantity, Reachable
 
-_POOL = 4096  # configurations
-_EXAMPLES = 256  # of them in the policy file
-_BATCHES = 50  # of as many as the pool holds are drawn at most
-_NEAR = 0.1  # rad, by which a joint of a drawn configuration may differ from that in the pool
+_EXAMPLES = 256  # goals in the policy file
+_TRIES = 64  # configurations drawn at a time at least
+_HARDLY = 1e-3  # a share of configurations that lead there; with less, something is wrong
 
 
 class ReachableGoals:
@@ -53,35 +52,42 @@ class ReachableGoals:
         self._lower, self._upper = middle - half, middle + half
         self._low, self._high = np.array(low), np.array(high)
         self._kinematics, self._quantity, self._surroundings = kinematics, quantity, surroundings
-        self._pool = self._draw_pool(torch.Generator().manual_seed(0))
         turns = [1.0] * (4 if quantity is Quantity.POSE else 0)
-        examples = self._goals(self._pool[:_EXAMPLES])
+        _, examples = self._draw(_EXAMPLES, torch.Generator().manual_seed(0))
         self.region = Reachable((*low, *[-each for each in turns]), (*high, *turns), tuple(examples.ravel().tolist()))
 
-    def known(self, count: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return configurations [count, n], rad, and the goals that they lead to, [count, g]."""
-        return self._pool[:count], self._goals(self._pool[:count])
-
     def sample(self, rows: int, generator: torch.Generator) -> np.ndarray:
-        """Draw goals [rows, g]: a configuration of the pool, of which each joint is moved a little."""
-        known = self._pool[torch.randint(len(self._pool), (rows,), generator=generator).numpy()]
-        draw = torch.rand(known.shape, generator=generator, dtype=torch.float64).numpy()
-        moved = np.clip(known + _NEAR * (2 * draw - 1), self._lower, self._upper)
-        goals = self._goals(moved)
-        return np.where(self._allowed(moved, goals)[:, None], goals, self._goals(known))
+        """Draw goals [rows, g]."""
+        return self._draw(rows, generator)[1]
 
-    def _draw_pool(self, generator: torch.Generator) -> np.ndarray:
-        found: list[np.ndarray] = []
-        for _ in range(_BATCHES):
-            draw = torch.rand(_POOL, len(self._lower), generator=generator, dtype=torch.float64).numpy()
+    def known(self, count: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return configurations [count, n], rad, far from touching anything, and goals they lead to, [count, g]."""
+        configurations, goals = self._draw(2 * count, torch.Generator().manual_seed(1))
+        if self._surroundings is None:
+            return configurations[:count], goals[:count]
+        clearance = self._surroundings.distance(configurations).min(axis=1)
+        clear = np.sort(np.argsort(-clearance, kind="stable")[:count])
+        return configurations[clear], goals[clear]
+
+    def _draw(self, rows: int, generator: torch.Generator) -> tuple[np.ndarray, np.ndarray]:
+        """Draw configurations [rows, n] until there are enough that lead there; return their goals [rows, g], too."""
+        found: list[tuple[np.ndarray, np.ndarray]] = []
+        drawn = 0
+        while (left := rows - sum(len(goals) for _, goals in found)) > 0:
+            if drawn > rows / _HARDLY + 100 * _TRIES:
+                raise UserError(
+                    f"env.task.region: of {drawn:,} configurations of the robot only {rows - left:,} lead, without "
+                    f"touching anything, into the box from {self._low.tolist()} to {self._high.tolist()}"
+                )
+            tries = max(_TRIES, 16 * left)
+            draw = torch.rand(tries, len(self._lower), generator=generator, dtype=torch.float64).numpy()
             configurations = self._lower + (self._upper - self._lower) * draw
-            found.append(configurations[self._allowed(configurations, self._goals(configurations))])
-            if sum(map(len, found)) >= _POOL:
-                return np.concatenate(found)[:_POOL]
-        raise UserError(
-            f"env.task.region: of {_BATCHES * _POOL:,} configurations of the robot only {sum(map(len, found)):,} lead, "
-            f"without touching anything, into the box from {self._low.tolist()} to {self._high.tolist()}"
-        )
+            goals = self._goals(configurations)
+            allowed = self._allowed(configurations, goals)
+            found.append((configurations[allowed], goals[allowed]))
+            drawn += tries
+        configurations, goals = (np.concatenate(arrays)[:rows] for arrays in zip(*found, strict=True))
+        return configurations, goals
 
     def _allowed(self, configurations: np.ndarray, goals: np.ndarray) -> np.ndarray:
         allowed: np.ndarray = np.all((goals[:, :3] >= self._low) & (goals[:, :3] <= self._high), axis=1)

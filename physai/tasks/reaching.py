@@ -23,7 +23,7 @@ class Reaching(Task):
         success_ends: Whether success ends the episode; else a policy learns to stay there until time is up.
         settle: How long the end effector must stay there to succeed, s; with 0 touching the goal is enough.
         smoothness: Weight of what changes of the action cost: their mean over the joints, as a share of the action.
-        posture: Weight of what being away from ``rest`` costs, which is home: the mean over the joints of the square of
+        posture: Weight of what being away from home costs: the mean over the joints of the square of
             the distance, as a share of half the joint's range. It keeps an arm from winding up into its limits.
         collision: What touching itself, the floor or a box costs, which ends the episode; 0: nothing is looked at.
         safe_distance: Nearer than this, m, costs a share of ``collision`` in each step.
@@ -80,10 +80,6 @@ class Reaching(Task):
         """See :class:`physai.tasks.Task`."""
         return None if self.surroundings is None else self.surroundings.distance(joint_position).min(axis=1)
 
-    def rest(self, goal: np.ndarray) -> np.ndarray:
-        """Return the posture to which the ``posture`` term draws robots with goals [N, g]: [n] or [N, n], rad."""
-        return self._home
-
     def rewards(self, step: Step, success: np.ndarray) -> dict[str, np.ndarray]:
         """Minus the errors, the bonus, and what changing the action, being away from home and collisions cost."""
         terms = {
@@ -94,7 +90,7 @@ class Reaching(Task):
         if self._smoothness:
             terms["smoothness"] = -self._smoothness * np.abs(step.action - step.last_action).mean(axis=1)
         if self._posture:
-            away = (step.state.joint_position - self.rest(step.goal)) / self._half_range
+            away = (step.state.joint_position - self._home) / self._half_range
             terms["posture"] = -self._posture * np.square(away).mean(axis=1)
         if step.clearance is not None:
             near = np.clip(1.0 - step.clearance / self._safe_distance, 0.0, 1.0)

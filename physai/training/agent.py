@@ -149,6 +149,8 @@ def make_actor(config: TrainConfig, env: TransformedRobotEnv) -> TensorDictModul
     actor = make("policy.actor", config.policy.actor, needs=(*_NETWORK, "deterministic"), **sizes)
     if getattr(actor, "memory_size", 0) != config.policy.memory_size:  # the env is made first, from the config
         raise UserError("policy.actor: how much an actor remembers is its argument memory_size")
+    if getattr(actor, "residual", False) and not env.simulation.task.module.suggests:
+        raise UserError(f"policy.actor: it adds to what the task suggests, and that of '{config.env.name}' does not")
     return actor
 
 

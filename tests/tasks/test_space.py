@@ -99,8 +99,8 @@ def test_what_is_said_to_shorten_the_errors_does(simulate, name):
     task, n = simulation.task, len(simulation.spec.joints)
     q, goal = inside_of_limits(simulation, 50), task.sample_goal(50, generator(1))
     _, features = task.module(*(torch.from_numpy(array).float() for array in (q, np.zeros_like(q), goal)))
-    size = len(task.module.coarse)
-    errors = features[:, -2 * size : -size] / task.module.coarse
+    size, end = len(task.module.coarse), features.shape[1] - task.module.suggests * n
+    errors = features[:, end - 2 * size : end - size] / task.module.coarse
     before = task.error(state_at(q), goal)
     for column, joints in enumerate(errors[:, 3 * len(before[0]) :].split(n, dim=1)):
         step = joints.double().numpy()
