@@ -15,6 +15,7 @@ from physai.training.config import TrainConfig
 from physai.training.run import load_config
 from tests.docs.blocks import FILES, PAGES, ROOT, Block, blocks, commands, hooks, prose
 from tests.docs.command_lines import SOURCES, check, exists, parameter_class
+from tests.docs.test_cpp import COMPILER
 from tests.test_contributing import EXAMPLE
 
 HOOKS = hooks()
@@ -23,7 +24,7 @@ CONSOLE = {block.text.splitlines()[0]: block for block in blocks("console")}
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("block", blocks("bash"), ids=str)
+@pytest.mark.parametrize("block", [block for block in blocks("bash") if COMPILER not in block.text], ids=str)
 def test_each_command_exists_and_takes_what_it_is_given(block):
     for words in commands(block.text):
         check(words)
