@@ -6,7 +6,7 @@ from torchrl.data import Composite, Unbounded
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from physai.errors import UserError
-from physai.policies import Critic, GaussianActor, input_size
+from physai.policies import Critic, GaussianActor, ResidualActor, input_size
 
 
 @pytest.fixture
@@ -41,6 +41,22 @@ def test_the_probability_ratio_of_unchanged_weights_is_one_even_where_tanh_is_fl
     assert (data["action"].abs() == 1.0).all()
     log_ratio = actor.get_dist(data).log_prob(data["latent_action"]) - data["action_log_prob"]
     assert log_ratio.abs().max() < 1e-4
+
+
+def test_an_untrained_residual_actor_does_what_is_suggested():
+    torch.manual_seed(0)
+    actor = ResidualActor(5, 2, ["x", "features"], [8], "torch.nn.Tanh", initial_std=0.3)
+    features = torch.randn(64, 4)
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        data = actor(TensorDict({"x": torch.randn(64, 1), "features": features}, [64]))
+    torch.testing.assert_close(data["action"], torch.tanh(features[:, 2:]), atol=0.05, rtol=0)
+    seen = torch.cat([data["x"], features], dim=1)
+    assert torch.equal(torch.jit.script(actor.deterministic())(seen), data["action"])
+
+
+def test_a_residual_actor_must_see_the_features_last():
+    with pytest.raises(UserError, match=r"policy\.actor\.in_keys: the last must be features"):
+        ResidualActor(5, 2, ["features", "x"], [8], "torch.nn.Tanh", initial_std=0.3)
 
 
 def test_the_critic_may_see_what_the_actor_does_not():
