@@ -12,13 +12,13 @@ from physai.robots.spec import RobotSpec
 _ARM = 0.3  # m/rad, by which angles count beside lengths
 _BENT = 0.1  # m², by which a pose may be farther whose configuration is nearer to home
 _DAMPING = 3e-3  # m²
-_NEWTON = 13  # steps; by then the inverse is exact for what the damping leaves
 _REFINED = 3  # times
+_TRIED = 2  # configurations a pose
 _ROOM = 0.05  # rad, to the joints' limits
 
 
 class InverseKinematics(nn.Module):
-    """Finds the known configuration whose pose is nearest, and refines it; scripts with ``torch.jit.script``.
+    """Refines known configurations whose poses are nearest, and takes the best; scripts with ``torch.jit.script``.
 
     From wherever an arm is, following the way that shortens the error gets it stuck at its joint limits: many poses
     need another way to bend. A configuration that is known to lead near the pose has the right one. From there, steps
@@ -37,8 +37,8 @@ class InverseKinematics(nn.Module):
         self, spec: RobotSpec, kinematics: ForwardKinematics, configurations: np.ndarray, poses: np.ndarray
     ) -> None:
         super().__init__()
-        # TorchScript knows no constants of modules.
-        self.arm, self.angular, self.newton, self.refined = _ARM, _ARM / math.sqrt(2.0), _NEWTON, _REFINED
+        self.arm, self.angular = _ARM, _ARM / math.sqrt(2.0)  # TorchScript knows no constants of modules
+        self.refined, self.tried = _REFINED, _TRIED
         self.kinematics = kinematics
         lower, upper = spec.position_limit.T
         bent = np.square((configurations - spec.home) / ((upper - lower) / 2)).mean(axis=1)
@@ -50,7 +50,6 @@ class InverseKinematics(nn.Module):
             "lengths": places.square().sum(dim=1) + _BENT * torch.from_numpy(bent),
             "lower": torch.from_numpy(lower + _ROOM),
             "upper": torch.from_numpy(upper - _ROOM),
-            "twice": 2.0 * torch.eye(6),
             "damping": _DAMPING * torch.eye(6),
         }
         self.configurations: Tensor
@@ -58,34 +57,44 @@ class InverseKinematics(nn.Module):
         self.lengths: Tensor
         self.lower: Tensor
         self.upper: Tensor
-        self.twice: Tensor
         self.damping: Tensor
         for name, values in buffers.items():
             self.register_buffer(name, values.float())
 
     def forward(self, position: Tensor, rotation: Tensor) -> Tensor:
         """Map positions [N, 3], m, and rotation matrices [N, 3, 3] to configurations, rad, [N, n]."""
-        apart = self.lengths - 2.0 * torch.matmul(self._place(position, rotation), self.places)
-        found = self.configurations[apart.argmin(dim=1)]
+        apart = torch.addmm(self.lengths, self._place(position, rotation), self.places, alpha=-2.0)
+        found = self.configurations[apart.topk(self.tried, dim=1, largest=False)[1].flatten()]
+        position = position.repeat_interleave(self.tried, dim=0)
+        rotation = rotation.repeat_interleave(self.tried, dim=0)
+        error, jacobian = self._linearize(found, position, rotation)
         for _ in range(self.refined):
-            linear, turned, angular = self.kinematics.linearize_pose(torch.cos(found), torch.sin(found))
-            jacobian = torch.cat([linear[:, :, :-1], self.arm * angular], dim=1)
-            error = torch.cat([position - linear[:, :, -1], self.arm * rotation_vector(turned, rotation)], dim=1)
             found = found + self.least_squares(jacobian, error)
             found = torch.maximum(torch.minimum(found, self.upper), self.lower)
-        return found
+            error, jacobian = self._linearize(found, position, rotation)
+        best = error.square().sum(dim=1).view(-1, self.tried).argmin(dim=1, keepdim=True).unsqueeze(2)
+        found = found.view(-1, self.tried, found.shape[1])
+        return found.gather(1, best.expand(-1, 1, found.shape[2])).squeeze(1)
+
+    def _linearize(self, joint_position: Tensor, position: Tensor, rotation: Tensor) -> tuple[Tensor, Tensor]:
+        """Errors [N, 6], in m, and the Jacobian [N, 6, n] of what shortens them."""
+        linear, turned, angular = self.kinematics.linearize_pose(torch.cos(joint_position), torch.sin(joint_position))
+        error = torch.cat([position - linear[:, :, -1], self.arm * rotation_vector(turned, rotation)], dim=1)
+        return error, torch.cat([linear[:, :, :-1], self.arm * angular], dim=1)
 
     @torch.jit.export
     def least_squares(self, jacobian: Tensor, error: Tensor) -> Tensor:
         """Map Jacobians [N, 6, n] and errors [N, 6] to the joints' way Jᵀ(JJᵀ + λ)⁻¹e, rad, [N, n].
 
-        The inverse is found by Newton's method (Schulz, 1933): of products alone, which every form of a policy has.
+        Solved by Gauss and Jordan's elimination, which all forms of a policy have; the damping spares it the pivoting.
         """
         square = torch.bmm(jacobian, jacobian.transpose(1, 2)) + self.damping
-        inverse = 0.5 * self.twice / square.abs().sum(dim=2).amax(dim=1).unsqueeze(1).unsqueeze(2)
-        for _ in range(self.newton):
-            inverse = torch.bmm(inverse, self.twice - torch.bmm(square, inverse))
-        return torch.bmm(torch.bmm(error.unsqueeze(1), inverse), jacobian).squeeze(1)
+        rows = torch.cat([square, error.unsqueeze(2)], dim=2).permute(1, 2, 0).contiguous()  # [6, 7, N]
+        for k in range(6):
+            pivot = rows[k : k + 1] / rows[k, k]
+            others = rows - rows[:, k : k + 1] * pivot
+            rows = torch.cat([others[:k], pivot, others[k + 1 :]])
+        return torch.bmm(rows[:, 6:].permute(2, 1, 0), jacobian).squeeze(1)
 
     def _place(self, position: Tensor, rotation: Tensor) -> Tensor:
         """Poses as points, whose distance is that of the positions and of the angles."""
