@@ -1,7 +1,8 @@
 """physai: the shortest trustworthy way from a simulated robot arm to a policy on a ROS 2 robot.
 
 Importing it registers an id for each file of ``conf/env`` with Gymnasium, where that is installed, such as
-``physai/PandaReach-v0``, and one with exchangeable goals, ``physai/PandaReachGoal-v0``. It imports nothing heavy.
+``physai/PandaReach-v0``, one with exchangeable goals, ``physai/PandaReachGoal-v0``, and ``physai/RosReach-v0`` for the
+robot of any of these files behind ROS topics. It imports nothing heavy.
 """
 
 import importlib.util
@@ -22,7 +23,6 @@ _GYMNASIUM_IDS = {
     "PandaPose": "panda_pose",
     "Kuka7Reach": "kuka7_reach",
     "XarmReach": "xarm_reach",
-    "RosReacher": "ros_reacher",
 }
 
 
@@ -42,10 +42,14 @@ def _register() -> None:
             entry_point="physai.envs.gym_env:RobotGymEnv",
             vector_entry_point="physai.envs.gym_env:RobotVectorEnv",
             kwargs={"env": env},
-            nondeterministic=env == "ros_reacher",  # in real time nothing moves twice in exactly the same way
         )
-        if env != "ros_reacher":
-            register(f"physai/{name}Goal-v0", entry_point="physai.envs.goal_env:GoalGymEnv", kwargs={"env": env})
+        register(f"physai/{name}Goal-v0", entry_point="physai.envs.goal_env:GoalGymEnv", kwargs={"env": env})
+    register(
+        "physai/RosReach-v0",
+        entry_point="physai.ros.bridge.gym_env:RosGymEnv",
+        kwargs={"env": "reacher"},
+        nondeterministic=True,  # in real time nothing moves twice in exactly the same way
+    )
 
 
 if importlib.util.find_spec("gymnasium") is not None:  # a robot that only runs policies may not have it

@@ -85,7 +85,7 @@ BAD_TRAINING = {
     ),
     "too fast": (["env.robot.command_limit=[9,1]"], "beyond the limit of 'joint1', 2.5 rad/s"),
     "reversed range": (["randomization.payload.low=3"], "randomization.payload"),
-    "a robot behind ROS": (["env=ros_reacher"], "a policy is trained on simulated robots; this one it can drive with"),
+    "a robot behind ROS": (["physics=ros"], "a policy is trained on simulated robots; this one it can drive with"),
     "unknown physics": (
         ["physics._target_=physai.physics.pybullet.PyBulletPhysic"],
         "physics._target_: physai.physics.pybullet has no 'PyBulletPhysic'; did you mean 'PyBulletPhysics'?",
@@ -270,7 +270,7 @@ def test_an_env_that_is_chosen_stays_in_the_run_s_engine(run, copied):
         ("evaluate", ["run=run", "checkpoint=7"], "no checkpoint '7'; there are: best"),
         ("evaluate", ["run=run", "episodes=0"], "episodes: input should be greater than 0"),
         ("evaluate", ["run=run", "randomization=stron"], "did you mean 'strong'?"),
-        ("evaluate", ["run=run", "env=ros_reachr"], "env/ros_reachr: no such config; did you mean 'ros_reacher'?"),
+        ("evaluate", ["run=run", "env=kuka_reachr"], "env/kuka_reachr: no such config; did you mean 'kuka_reacher'?"),
         ("evaluate", ["run=run", "env=reacher", "env.task.tolerence=1"], "did you mean 'env.task.tolerance'?"),
         ("evaluate", ["run=run", "env=reacher", "env.task.tolerance=-1"], "task.tolerance: input should be greater"),
         (
@@ -281,7 +281,7 @@ def test_an_env_that_is_chosen_stays_in_the_run_s_engine(run, copied):
         ("play", ["run=run", "env=kuka_reacher"], "env 'kuka_reacher' has the joints"),
         (
             "evaluate",
-            ["run=run", "env=ros_reacher", "env.physics.remap=[joint_states]"],
+            ["run=run", "physics=ros", "physics.remap=[joint_states]"],
             "physics.remap: string should match pattern",
         ),
         (
@@ -290,7 +290,16 @@ def test_an_env_that_is_chosen_stays_in_the_run_s_engine(run, copied):
             "env.physics: RosPhysics.__init__() missing 4 required positional arguments: 'homing_speed'",
         ),
         ("evaluate", ["run=run", "physics=mujoc"], "physics/mujoc: no such config; did you mean 'mujoco'?"),
-        ("evaluate", ["run=run", "env=ros_reacher", "physics=mujoco"], "robots of 'ros_reacher' come with their own"),
+        (
+            "evaluate",
+            [
+                "run=run",
+                "env=reacher",
+                "physics=mujoco",
+                "env.physics={_target_: physai.physics.pybullet.PyBulletPhysics}",
+            ],
+            "robots of 'reacher' come with their own",
+        ),
         ("evaluate", [], "run=... is required"),
         ("play", ["run=run", "output=arm.avi"], "must end in .mp4 or .gif"),
         ("play", ["run=run", "render=windw"], "render: input should be 'video' or 'human'"),

@@ -23,6 +23,7 @@ PARTS = {
     "update": "learning from a batch, against PPO written by hand",
     "training": "time to 99 percent of unseen goals, against the PPO of Stable-Baselines3, rsl_rl and SBX",
     "algorithms": "time to 95 percent of unseen goals of every algorithm, against Stable-Baselines3's of the same name",
+    "arms": "time to 95 percent of a Panda's unseen goals, against PPO, and TQC with hindsight replay",
     "growth": "time and memory of training against frames and robots",
 }
 NEEDS = {  # the extra that a part needs, and its modules
@@ -31,6 +32,7 @@ NEEDS = {  # the extra that a part needs, and its modules
     "gym": ("bench", ["stable_baselines3"]),
     "training": ("bench,mujoco", ["stable_baselines3", "mujoco"]),
     "algorithms": ("bench", ["stable_baselines3"]),
+    "arms": ("bench,mujoco", ["sb3_contrib", "panda_gym", "mujoco"]),
     "collection": ("ray", ["ray"]),
     "engines": ("mujoco", ["mujoco"]),
     "growth": ("bench", ["psutil"]),
@@ -66,12 +68,14 @@ def _options() -> argparse.Namespace:
     parser.add_argument("--seeds", type=int, default=5, help="train so often, with seeds counting up (5)")
     peer_seconds = "when a peer gives up a training; what physai is ahead by is then a lower bound (100)"
     parser.add_argument("--peer-seconds", type=float, default=100.0, help=peer_seconds)
+    arm_times = "a peer of --arms gives up when it has learned for so many times physai's time (22)"
+    parser.add_argument("--arm-times", type=float, default=22.0, help=arm_times)
     figure = Path("outputs/growth.png")
     parser.add_argument("--figure", type=Path, default=figure, help=f"where --growth draws ({figure})")
     options = parser.parse_args()
     options.parts = options.parts or list(PARTS)
-    if options.seed < 0 or options.seeds < 1 or options.peer_seconds <= 0:
-        parser.error("--seed must not be negative, --seeds and --peer-seconds must be positive")
+    if options.seed < 0 or options.seeds < 1 or min(options.peer_seconds, options.arm_times) <= 0:
+        parser.error("--seed must not be negative, --seeds, --peer-seconds and --arm-times must be positive")
     return options
 
 

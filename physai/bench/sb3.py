@@ -166,6 +166,13 @@ def as_it_comes(algorithm: str) -> Settings:
     return Settings(partial(make_vec_env, "physai/Reacher-v0", envs), {"learning_rate": rate}, kind, frames=1024)
 
 
+def _with_goals(observation: Array, space: spaces.Dict) -> dict[str, Array]:
+    """What a goal env shows, from what its task observes, [N, o]: that ends with where the robot is, and the goal."""
+    (size,) = space["desired_goal"].shape or ()
+    own = observation[:, :-size]
+    return {"observation": own, "achieved_goal": own[:, -size:], "desired_goal": observation[:, -size:]}
+
+
 class Learner:
     """An algorithm, some frames at a time.
 
@@ -185,7 +192,8 @@ class Learner:
         # Torch would check the arguments of every distribution, at every step.
         torch.distributions.Distribution.set_default_validate_args(False)
         arguments["learning_rate"] = self._learning_rate
-        self.model = settings.algorithm("MlpPolicy", self._envs, seed=seed, device="cpu", **arguments)
+        policy = "MultiInputPolicy" if isinstance(self._envs.observation_space, spaces.Dict) else "MlpPolicy"
+        self.model = settings.algorithm(policy, self._envs, seed=seed, device="cpu", **arguments)
         self.model.set_logger(Logger(None, []))
 
     def _learning_rate(self, _: float) -> float:
@@ -203,10 +211,14 @@ class Learner:
 
     def act(self, *seen: Tensor) -> Tensor:
         """Return the actions of the policy's mode [N, n], told what ``in_keys`` name."""
-        told: Any = torch.cat(seen, dim=1).numpy()
+        told, space = torch.cat(seen, dim=1).numpy(), self._envs.observation_space
+        return torch.from_numpy(self.predict(_with_goals(told, space) if isinstance(space, spaces.Dict) else told))
+
+    def predict(self, told: Any) -> Array:
+        """Return the actions of the policy's mode, told what its envs show."""
         if isinstance(self._envs, VecNormalize):
             told = self._envs.normalize_obs(told)
-        return torch.from_numpy(self.model.predict(told, deterministic=True)[0])
+        return self.model.predict(told, deterministic=True)[0]
 
     def close(self) -> None:
         """Free the robots."""

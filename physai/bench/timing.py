@@ -47,7 +47,12 @@ def median_speeds(*sides: Callable[[], int], rounds: int) -> list[float]:
 
 def reacher(seed: int, *overrides: str) -> TrainConfig:
     """The config that is measured."""
-    return validate(TrainConfig, compose("train", ["env=reacher", f"seed={seed}", *overrides]))
+    return config_of("reacher", seed, *overrides)
+
+
+def config_of(env: str, seed: int, *overrides: str) -> TrainConfig:
+    """The config of an env."""
+    return validate(TrainConfig, compose("train", [f"env={env}", f"seed={seed}", *overrides]))
 
 
 def table(title: str, *columns: str) -> Table:

@@ -28,7 +28,8 @@ TARGET = 0.99
 GOALS = 1000
 GOALS_SEED = derive(0, "benchmark goals")  # the same for all, unseen in training
 FAST_ENGINE = ("physics=mujoco", f"physics.threads={os.cpu_count()}")  # PyBullet would judge for most of the time
-JUDGE_EVERY = 4096  # frames, and
+JUDGE_EVERY = 4096  # frames, or
+JUDGE_AFTER = 5.0  # s of learning, whichever comes first; and no sooner than
 JUDGE_SHARE = 1 / 16  # of those so far: slow learners would spend their time on being judged
 
 
@@ -71,7 +72,8 @@ def run_race(
     """
     while not race.won and race.frames < max_frames and race.seconds < max_seconds:
         due = min(race.frames + max(JUDGE_EVERY, JUDGE_SHARE * race.frames), max_frames)
-        while race.frames < due:
+        late = min(race.seconds + max(JUDGE_AFTER, JUDGE_SHARE * race.seconds), max_seconds)
+        while race.frames < due and race.seconds < late:
             frames, seconds = timed(learn)
             race.frames += frames
             race.seconds += seconds
@@ -139,15 +141,15 @@ def measure_training(seed: int, seeds: int, conditions: Conditions) -> dict[str,
     here = {name: peer for name, peer in PEERS.items() if find_spec(peer[0])}
     for name in PEERS.keys() - here.keys():
         print(f"{name}: {PEERS[name][0]} is not here; left out (pip install 'physai[bench]')", flush=True)
-    threads = {name: _apart(_fastest_threads, name) for name in here}
+    threads = {name: apart(_fastest_threads, name) for name in here}
     races: dict[str, list[Race]] = {name: [] for name in (*OURS, *here)}
     for one in range(seed, seed + seeds):  # the sides take turns, so that a busy machine slows them alike
         for name in races:
-            races[name].append(_apart(_race, name, one, threads.get(name, 1), conditions))
+            races[name].append(apart(_race, name, one, threads.get(name, 1), conditions))
     return races
 
 
-def _apart(function: Callable[..., Any], *arguments: Any) -> Any:
+def apart(function: Callable[..., Any], *arguments: Any) -> Any:
     """Call in a process of its own."""
     with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as executor:
         return executor.submit(function, *arguments).result()

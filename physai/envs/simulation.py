@@ -33,7 +33,8 @@ class StartConfig(Config):
     """Where episodes begin.
 
     ``spread``: uniformly within the home pose plus or minus this, rad, one value a joint. ``carried_over``: a share of
-    the episodes that begins where the last one ended, as on a robot that gets one goal after the other.
+    the episodes that begins where the last one ended, as on a robot that gets one goal after the other. A robot that is
+    not simulated begins at home, for it cannot be put anywhere at once.
     """
 
     spread: list[NonNegativeFloat]
@@ -101,6 +102,7 @@ class Simulation:
         self.layout = ParameterLayout(self.spec)
         self.joint_command = JointCommand(self.spec, config.control_dt)
         self.task: Task = make("env.task", config.task, self.spec, self.kinematics, needs=_TASK)
+        self._simulated = config.simulated
         sizes = num_envs, config.control_dt, config.substeps
         self.physics: Physics = make("env.physics", config.physics, self.spec, *sizes, needs=_PHYSICS)
         self.generator = torch.Generator()
@@ -170,6 +172,8 @@ class Simulation:
         config, spec, count = self.config.start, self.spec, len(rows)
         position = np.tile(spec.home, (count, 1))
         velocity = np.zeros_like(position)
+        if not self._simulated:
+            return RobotState(position, velocity)
         if any(config.spread):  # else a seed gives the same goals to robots one after the other as side by side
             draw = torch.rand(position.shape, generator=self.generator, dtype=torch.float64).numpy()
             position = np.clip(position + (2 * draw - 1) * np.array(config.spread), *spec.position_limit.T)

@@ -60,7 +60,7 @@ def _check(node: DictConfig) -> None:
     for run in config.runs:
         policy = config.load(run)
         if not policy.config.env.simulated:
-            raise UserError(f"env '{policy.config.env.name}': only simulated robots can be given other parameters")
+            raise UserError("physics: only simulated robots can be given other parameters")
         for name in (config.x, config.y):
             config.axis(name, policy)
 

@@ -58,8 +58,8 @@ class Agent:
         """
         if not config.env.simulated:
             raise UserError(
-                f"env={config.env.name}: a policy is trained on simulated robots; this one it can drive with "
-                f"python -m physai.evaluate run=<run> env={config.env.name}"
+                "physics: a policy is trained on simulated robots; this one it can drive with "
+                "python -m physai.evaluate run=<run> physics=..."
             )
         device = torch.device(config.device)
         if device.type == "cuda" and (device.index or 0) >= torch.cuda.device_count():

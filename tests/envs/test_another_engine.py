@@ -96,7 +96,7 @@ def test_an_engine_is_chosen_by_name_and_one_that_an_env_brings_along_stays(env_
     chosen = env_config(name, "physics=mujoco", "physics.motor=servo").physics
     assert chosen["_target_"] == "physai.physics.mujoco.MuJoCoPhysics"
     assert chosen["motor"] == "servo"
-    assert env_config("ros_reacher", "physics=mujoco").physics["_target_"] == "physai.ros.RosPhysics"
+    assert env_config(name, DUMMY, "physics=mujoco").physics == {"_target_": "tests.physics.dummy.DummyPhysics"}
 
 
 @pytest.mark.parametrize(

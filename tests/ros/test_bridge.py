@@ -13,9 +13,11 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 import physai
+from physai.envs.simulation import Simulation
+from physai.physics import RobotState
 from tests.ros.peer import wait_for
 
-NAME = "physai/RosReacher-v0"
+NAME = "physai/RosReach-v0"
 WITHOUT_ROS = "import sys; sys.modules['rclpy'] = None\n"  # as if it were not installed
 
 
@@ -101,10 +103,48 @@ def test_an_episode_over_ros_is_the_episode_in_process(start_robot, make):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("name", ["panda_reach", "panda_pose"])
+def test_an_arm_of_seven_joints_is_driven_and_seen_as_in_simulation(start_robot, peer, make, env_config, name):
+    config = env_config(name)
+    joints = config.robot.joints
+    start_robot(env=name, state_joints=f"[{','.join(reversed(joints))}]")  # matched by name, not by place
+    simulated, ours = Simulation(config, 1, seed=0), make(env=name)
+
+    def compare(observation, info):
+        shown = ours.unwrapped.simulation
+        positions = shown.state.joint_position[0].tolist()
+
+        def heard():
+            return next((m for _, m in reversed(peer.joint_states) if m.position[::-1].tolist() == positions), None)
+
+        message = wait_for(heard, what="the joint state that the env has seen")
+        assert message.name == list(reversed(joints))
+        state = RobotState(*(np.array([values[::-1]]) for values in (message.position, message.velocity)))
+        np.testing.assert_array_equal(observation, simulated.task.observe(state, shown.goal)[0])
+        names = [tolerance.name for tolerance in simulated.task.tolerances]
+        expected = dict(zip(names, simulated.task.error(state, shown.goal)[0].tolist(), strict=True))
+        assert {key: info[key] for key in names} == expected
+        return state.joint_position[0]
+
+    observation, info = ours.reset(seed=3)
+    start = compare(observation, info)
+    np.testing.assert_allclose(start, config.robot.home, atol=0.02)
+    action = np.array([0.3, -0.3, 0.3, 0.3, -0.3, 0.3, -0.3], np.float32)
+    for _ in range(25):
+        observation, reward, terminated, truncated, info = ours.step(action)
+        end = compare(observation, info)
+        assert (np.isfinite(reward), terminated, truncated) == (True, False, False)
+    expected = action * np.array(config.robot.command_limit)
+    np.testing.assert_allclose(peer.commands[-1][1], expected, rtol=1e-6)
+    np.testing.assert_allclose(end - start, 0.5 * expected, atol=0.03)  # 25 periods of 20 ms
+    simulated.close()
+
+
+@pytest.mark.slow
 def test_without_rclpy_one_line_says_what_to_install():
     done = in_fresh_python(
         WITHOUT_ROS + "import gymnasium, physai\n"
-        "try: gymnasium.make('physai/RosReacher-v0')\n"
+        "try: gymnasium.make('physai/RosReach-v0')\n"
         "except physai.UserError as error: print(error)\n"
     )
     assert done.stdout == "rclpy is not installed: pip install 'physai[ros]', or source ROS 2 Jazzy\n", done.stderr
@@ -118,7 +158,7 @@ def test_the_other_envs_need_no_rclpy():
 
 @pytest.mark.slow
 def test_where_there_is_no_robot_evaluate_says_so_in_one_line(start, run):
-    command = start.run(evaluate(f"run={run}", "env=ros_reacher"))
+    command = start.run(evaluate(f"run={run}", "physics=ros"))
     assert command.wait(60.0) == 2
     assert command.says("error:") == "error: no joint state came on /joint_states within 5 s"
     assert not list(run.glob("evaluation_*"))
@@ -127,7 +167,7 @@ def test_where_there_is_no_robot_evaluate_says_so_in_one_line(start, run):
 @pytest.mark.slow
 def test_evaluate_refuses_to_randomize_a_robot_behind_ros(start, start_robot, peer, run):
     start_robot()
-    command = start.run(evaluate(f"run={run}", "env=ros_reacher", "randomization=default"))
+    command = start.run(evaluate(f"run={run}", "physics=ros", "randomization=default"))
     assert command.wait(60.0) == 2
     assert "cannot be set; choose randomization=none" in command.says("error:")
     assert not any(any(velocity) for _, velocity in peer.commands)
@@ -137,7 +177,7 @@ def test_evaluate_refuses_to_randomize_a_robot_behind_ros(start, start_robot, pe
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_an_interrupted_evaluation_leaves_a_standing_arm(start, start_robot, peer, run, number, code):
     start_robot()
-    command = start.run(evaluate(f"run={run}", "env=ros_reacher"))
+    command = start.run(evaluate(f"run={run}", "physics=ros"))
     wait_for(lambda: any(any(velocity) for _, velocity in peer.commands), 60.0, "a command")
     command.signal(number)
     assert command.wait() == code
@@ -151,11 +191,11 @@ def test_an_interrupted_evaluation_leaves_a_standing_arm(start, start_robot, pee
 def test_a_policy_reaches_the_same_goals_over_ros_as_in_process(start, start_robot, run):
     start_robot()
     here = ["env=reacher", "env.start.spread=[0.0,0.0]", "randomization=none"]
-    for arguments in (["env=ros_reacher"], here):
+    for arguments in (["physics=ros"], here):
         command = start.run(evaluate(f"run={run}", "episodes=15", "in_a_row=0", *arguments))
         assert command.wait(280.0) == 0, command.output
     over_ros, in_process = (
-        json.loads((run / f"evaluation_{name}_none.json").read_text()) for name in ("ros_reacher", "reacher")
+        json.loads((run / f"evaluation_{name}_none.json").read_text()) for name in ("ros", "reacher")
     )
     for name, result in (("over ROS", over_ros), ("in process", in_process)):
         print(f"{name}: {result['success_rate']:.0%} of 15 goals, {result['steps_to_goal']:.1f} steps to goal")

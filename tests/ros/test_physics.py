@@ -270,7 +270,7 @@ def test_a_program_that_ends_in_any_way_leaves_a_standing_arm(start, start_robot
     script = f"""
 import os, signal
 import numpy as np, gymnasium, physai
-env = gymnasium.make("physai/RosReacher-v0")
+env = gymnasium.make("physai/RosReach-v0")
 env.reset()
 for _ in range(10):
     env.step(np.ones(2, np.float32))

@@ -128,7 +128,7 @@ def test_reset_brings_it_home():
 
 @pytest.mark.parametrize(("motor", "tolerance"), [("impulse", 2e-3), ("servo", 5e-3)])  # friction slows a servo down
 def test_an_arm_in_another_engine_moves_as_told(motor, tolerance):
-    arm = VirtualArm("ros_reacher", "none", 0, 0.01, [f"physics.motor={motor}"], "mujoco")
+    arm = VirtualArm("reacher", "none", 0, 0.01, [f"physics.motor={motor}"], "mujoco")
     try:
         steps = np.array([arm.step(np.array([0.5, -0.3]))[0] for _ in range(50)])
         np.testing.assert_allclose(steps[-1] - steps[-11], [0.05, -0.03], rtol=0, atol=tolerance)
@@ -143,3 +143,8 @@ def test_an_arm_in_another_engine_moves_as_told(motor, tolerance):
 def test_an_unknown_config_is_named(env, randomization, physics):
     with pytest.raises(UserError, match=r"nobody|nothing|no_engine"):
         VirtualArm(env, randomization, 0, 0.01, physics=physics)
+
+
+def test_an_arm_is_not_simulated_by_a_robot_behind_ros():
+    with pytest.raises(UserError, match="physics: 'ros' is no engine that could simulate a robot"):
+        VirtualArm("reacher", "none", 0, 0.01, physics="ros")

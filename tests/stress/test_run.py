@@ -100,7 +100,7 @@ def test_the_command_draws_a_map_of_several_runs_and_writes_counts_and_intervals
         (["x=payload", "y=payload"], "x and y are both 'payload'"),
         (["output=map.pdf"], "output: 'map.pdf' must end in .png"),
         (["grid=1"], "grid: input should be greater than or equal to 2, got 1"),
-        (["env=ros_reacher"], "env 'ros_reacher': only simulated robots can be given other parameters"),
+        (["physics=ros"], "physics: only simulated robots can be given other parameters"),
         (["run=[nowhere]"], "nowhere: no run there"),
     ],
 )

@@ -87,6 +87,8 @@ class VirtualArm:
         node = compose("train", [*(f"{group}={name}" for group, name in groups.items()), *overrides])
         node.env.physics = node.physics
         config = validate(EnvConfig, node.env)
+        if not config.simulated:
+            raise UserError(f"physics: '{physics}' is no engine that could simulate a robot")
         draws = validate(RandomizationConfig, node.randomization)
         self.spec = RobotSpec.from_config(config.robot)
         self._physics: Physics = make("physics", config.physics, self.spec, 1, period, needs=("reset", "step", "close"))
