@@ -175,8 +175,9 @@ def load_module(content: bytes, inputs: Sequence[str]) -> torch.jit.ScriptModule
             found = [a.name for a in getattr(module, method).schema.arguments[1:]] if hasattr(module, method) else None
             if found != list(arguments):
                 raise PolicyError(f"its {method} takes {found}, not {list(arguments)}")
-        held = sorted(v.untyped_storage().nbytes() for v in module.state_dict().values())
-        if held != sorted(archive.tensor_sizes(content)):
+        storages = [tensor.untyped_storage() for tensor in module.state_dict().values()]
+        held = {s.data_ptr() or -place: s.nbytes() for place, s in enumerate(storages)}  # parts may share them
+        if sorted(held.values()) != sorted(archive.tensor_sizes(content)):
             raise PolicyError("its weights are shorter or longer than it says")
         return torch.jit.freeze(module, preserved_attrs=[ERROR])
 

@@ -99,13 +99,12 @@ class GaussianActor(TensorDictModuleBase):
     ) -> None:
         super().__init__()
         self.in_keys = in_keys
-        # It starts near standstill.
-        self.network: nn.Module = mlp(in_features, hidden_sizes, action_size, activation, last_gain=0.01)
+        self.network = mlp(in_features, hidden_sizes, action_size, activation, last_gain=0.01)  # start near standstill
         self.log_std = nn.Parameter(torch.full((action_size,), initial_std).log())
 
     def deterministic(self) -> nn.Module:
         """What acts without exploration, scriptable: ``in_keys`` side by side, [N, in_features], to actions [N, n]."""
-        return nn.Sequential(self.network, nn.Tanh())
+        return nn.Sequential(*self.network, nn.Tanh())
 
     def mean(self, tensordict: TensorDictBase) -> Tensor:
         """Mean of the latent action, [.., n]."""
@@ -149,7 +148,7 @@ class ResidualActor(GaussianActor):
         super().__init__(in_features, action_size, *args, **kwargs)
         if self.in_keys[-1] != "features":
             raise UserError("policy.actor.in_keys: the last must be features, which end with what the task suggests")
-        self.network = Residual(self.network, action_size)
+        self.network = nn.Sequential(Residual(self.network, action_size))
 
 
 class Residual(nn.Module):

@@ -14,6 +14,7 @@ _BENT = 0.1  # m², by which a pose may be farther whose configuration is nearer
 _DAMPING = 3e-3  # m²
 _REFINED = 3  # times
 _TRIED = 2  # configurations a pose
+_BETTER = 1e-3  # m², by which a later one must be: else rounding would choose between two that lead there
 _ROOM = 0.05  # rad, to the joints' limits
 
 
@@ -51,6 +52,7 @@ class InverseKinematics(nn.Module):
             "lower": torch.from_numpy(lower + _ROOM),
             "upper": torch.from_numpy(upper - _ROOM),
             "damping": _DAMPING * torch.eye(6),
+            "later": _BETTER * torch.arange(_TRIED),
         }
         self.configurations: Tensor
         self.places: Tensor
@@ -58,6 +60,7 @@ class InverseKinematics(nn.Module):
         self.lower: Tensor
         self.upper: Tensor
         self.damping: Tensor
+        self.later: Tensor
         for name, values in buffers.items():
             self.register_buffer(name, values.float())
 
@@ -72,7 +75,8 @@ class InverseKinematics(nn.Module):
             found = found + self.least_squares(jacobian, error)
             found = torch.maximum(torch.minimum(found, self.upper), self.lower)
             error, jacobian = self._linearize(found, position, rotation)
-        best = error.square().sum(dim=1).view(-1, self.tried).argmin(dim=1, keepdim=True).unsqueeze(2)
+        worse = error.square().sum(dim=1).view(-1, self.tried) + self.later
+        best = worse.argmin(dim=1, keepdim=True).unsqueeze(2)
         found = found.view(-1, self.tried, found.shape[1])
         return found.gather(1, best.expand(-1, 1, found.shape[2])).squeeze(1)
 
