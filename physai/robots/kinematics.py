@@ -105,14 +105,15 @@ def quaternion_matrix(quaternion: Tensor) -> Tensor:
 def rotation_vector(start: Tensor, end: Tensor) -> Tensor:
     """Return the turn that takes rotation matrices ``start`` to ``end``, [N, 3, 3] each: axis times angle, rad, [N, 3].
 
-    Near half a turn the axis may be its opposite: both ways are as long.
+    At half a turn the axis may as well be its opposite. From 0.025 rad before on, the vector is shorter, down to zero
+    there: so it jumps nowhere.
     """
     turn = torch.bmm(end, start.transpose(1, 2))
     axis = torch.stack(
         [turn[:, 2, 1] - turn[:, 1, 2], turn[:, 0, 2] - turn[:, 2, 0], turn[:, 1, 0] - turn[:, 0, 1]], dim=1
     )
-    length = torch.linalg.vector_norm(axis, dim=1, keepdim=True).clamp(min=1e-9)
-    return axis / length * angle_between(start, end)
+    angle, length = angle_between(start, end), torch.linalg.vector_norm(axis, dim=1, keepdim=True)  # 2 sin(angle)
+    return axis * angle / torch.where(angle > 3.0, length.clamp(min=0.05), length.clamp(min=1e-9))
 
 
 def angle_between(start: Tensor, end: Tensor) -> Tensor:

@@ -286,8 +286,18 @@ def test_the_turn_between_two_rotations_is_the_shorter_way_for_a_quaternion_and_
     expected = (Rotation.from_quat(second) * Rotation.from_quat(first).inv()).as_rotvec()
     angle = float(angle_between(start, end))
     assert angle == pytest.approx(np.linalg.norm(expected), abs=1e-6)
-    if angle < np.pi - 1e-3:
+    if angle < np.pi - 0.03:
         np.testing.assert_allclose(rotation_vector(start, end)[0], expected, atol=1e-6)
+
+
+def test_a_turn_jumps_nowhere_also_not_at_half_a_turn():
+    start = torch.eye(3).unsqueeze(0)
+    for angle in np.linspace(np.pi - 0.04, np.pi + 0.04, 801):
+        end = torch.from_numpy(Rotation.from_rotvec([angle, 0.0, 0.0]).as_matrix()).float().unsqueeze(0)
+        turn = rotation_vector(start, end)
+        if angle > np.pi - 0.04:
+            assert float(torch.dist(turn, before)) < 0.02
+        before = turn
 
 
 def test_no_turn_and_half_a_turn_are_told_in_single_precision():
