@@ -59,8 +59,8 @@ def main() -> None:
 def _options() -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         prog="python -m physai.bench",
-        description="Measure physai on the two-link arm, side by side with what it is compared to: the parts that are "
-        "named, or all of them, which takes an hour and a half.",
+        description="Measure physai on the two-link arm and a Panda, side by side with what it is compared to: the "
+        "parts that are named, or all of them, which takes almost two hours.",
     )
     for part, meaning in PARTS.items():
         parser.add_argument(f"--{part}", dest="parts", action="append_const", const=part, help=meaning)
