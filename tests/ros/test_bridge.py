@@ -103,6 +103,7 @@ def test_an_episode_over_ros_is_the_episode_in_process(start_robot, make):
 
 
 @pytest.mark.slow
+@pytest.mark.realtime
 @pytest.mark.parametrize("name", ["panda_reach", "panda_pose"])
 def test_an_arm_of_seven_joints_is_driven_and_seen_as_in_simulation(start_robot, peer, make, env_config, name):
     config = env_config(name)

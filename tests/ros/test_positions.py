@@ -77,10 +77,14 @@ def test_a_watchdog_repeats_the_last_positions_and_makes_none_up(listener, run):
     run("command_watchdog", command="joint_position", joints=2, timeout=0.1)
     time.sleep(1.0)
     assert listener.targets == []
-    for _ in range(3):
+
+    def commanded():
+        """Again and again: who publishes may know of a listener that does not know of it yet."""
         listener.publish("/command_watchdog/commands", Float64MultiArray(data=array("d", [0.3, -0.2])), 1)
         time.sleep(0.05)
-    wait_for(lambda: listener.targets, what="commands")
+        return listener.targets
+
+    wait_for(commanded, what="commands")
     since = time.monotonic() + 0.3
     wait_for(lambda: listener.targets[-1][0] > since, what="the watchdog's own commands")
     assert all(target == [0.3, -0.2] for _, target in listener.targets)
