@@ -14,6 +14,7 @@ from physai.robots import ForwardKinematics, RobotSpec
 from physai.signals import Quantity, Reachable
 
 _EXAMPLES = 256  # goals in the policy file
+_CLEARANCE = 0.01  # m, which the controller's collision guard keeps, too: nearer, a robot would be held back
 _TRIES = 64  # configurations drawn at a time at least
 _HARDLY = 1e-3  # a share of configurations that lead there; with less, something is wrong
 
@@ -28,7 +29,7 @@ class ReachableGoals:
         low: Smallest x, y, z, m.
         high: Largest x, y, z, m.
         share: Of each joint's range, around its middle, that configurations are drawn from.
-        surroundings: What the robot must not touch; it must not touch itself either.
+        surroundings: What the robot must keep 1 cm away from, as from itself.
 
     Attributes:
         region: What a policy file says about it, with examples.
@@ -93,7 +94,7 @@ class ReachableGoals:
         allowed: np.ndarray = np.all((goals[:, :3] >= self._low) & (goals[:, :3] <= self._high), axis=1)
         if self._surroundings is not None:
             inside = allowed.nonzero()[0]
-            allowed[inside] = (self._surroundings.distance(configurations[inside]) > 0).all(axis=1)
+            allowed[inside] = (self._surroundings.distance(configurations[inside]) > _CLEARANCE).all(axis=1)
         return allowed
 
     @torch.no_grad()
