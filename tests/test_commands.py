@@ -49,6 +49,10 @@ BAD_TRAINING = {
         ["policy.actor.hidden_sizes=[-3]"],
         "policy.actor.hidden_sizes: input should be greater than 0",
     ),
+    "a residual of nothing": (
+        ["policy.actor._target_=physai.policies.ResidualActor"],
+        "policy.actor: it adds to what the task suggests, and that of 'reacher' does not",
+    ),
     "a policy that no robot could run": (
         ["policy.actor.in_keys=[features,physics_parameters]"],
         "policy.actor.in_keys: a policy that sees 'physics_parameters' cannot be exported",
