@@ -69,6 +69,12 @@ class JointCommands:
         """That no controller listens, or None."""
         return None if self._publisher.get_subscription_count() else f"no controller listens to {self.topic}"
 
+    @property
+    def arrived(self) -> bool:
+        """Whether all who are known to listen have the last command; a reliable listener whom one has just found may
+        not have found the publisher yet, and misses what it is sent until then."""
+        return self._publisher.wait_for_all_acked(Duration())
+
     def send(self, command: Sequence[float]) -> None:
         """Publish a command."""
         self._message.data = array("d", command)
