@@ -18,6 +18,7 @@ from geometry_msgs.msg import PointStamped
 from rcl_interfaces.msg import SetParametersResult
 from rcl_interfaces.srv import SetParameters
 from rclpy.context import Context
+from rclpy.duration import Duration
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -192,6 +193,11 @@ class Peer:
 
     def emergency_stop(self, pressed: bool = True) -> None:
         self.publish("/emergency_stop", Bool(data=pressed))
+
+    def release_emergency_stop(self) -> None:
+        """Say that it is not pressed, and wait until all have heard it: who presses it next is heard at once."""
+        self.emergency_stop(False)
+        assert self.publisher(Bool, "/emergency_stop").wait_for_all_acked(Duration(seconds=10))
 
     def call(self, service: str, request: Any = None) -> Any:
         """Call a service, std_srvs/Trigger unless a request says otherwise, and return its answer."""

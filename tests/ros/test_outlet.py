@@ -136,7 +136,7 @@ def test_an_end_waits_half_a_second_for_output_that_does_not_flow(tmp_path):
 def test_a_node_stops_the_arm_all_the_same(policy_path, tmp_path, kind, reasons):
     with blocked(kind, tmp_path) as output, closed_loop(policy_path, output=output) as loop:
         loop.start()
-        loop.peer.emergency_stop(False)  # so that the two have found each other
+        loop.peer.release_emergency_stop()  # so that the two have found each other
         bad = PointStamped()
         bad.header.frame_id = "nowhere" * 1000  # a long line
         for _ in range(100):

@@ -120,7 +120,7 @@ def test_a_node_whose_watchdog_never_came_waits_without_a_word(policy_path):
         wait_for(lambda: SILENT in loop.diagnosis()[1])
         loop.peer.silent(3.5)
         assert loop.peer.commands == []
-        loop.peer.emergency_stop(False)  # so that the two have found each other
+        loop.peer.release_emergency_stop()  # so that the two have found each other
         since = time.monotonic()
         loop.peer.emergency_stop()  # this it says to the controller itself
         assert loop.peer.first_zeros(after=since) < WITHIN
