@@ -71,8 +71,10 @@ class JointCommands:
 
     @property
     def arrived(self) -> bool:
-        """Whether all who are known to listen have the last command; a reliable listener whom one has just found may
-        not have found the publisher yet, and misses what it is sent until then."""
+        """Whether all who are known to listen have the last command.
+
+        A reliable listener that was just found may not have found the publisher yet. It misses what is sent until then.
+        """
         return self._publisher.wait_for_all_acked(Duration())
 
     def send(self, command: Sequence[float]) -> None:
