@@ -14,6 +14,7 @@ from physai.envs.make import TransformedRobotEnv
 MAX_ROBOTS = 1000
 ROBOTS_IN_A_ROW = 64
 SETTLED = 0.5  # s, at the end of an episode's time
+NEAR_LIMIT = 0.05  # rad
 
 
 def wilson(success: Tensor) -> tuple[float, float]:
@@ -161,7 +162,9 @@ def _one_round(policy: TensorDictModuleBase, env: TransformedRobotEnv) -> dict[s
 
 
 @torch.no_grad()
-def evaluate_in_a_row(policy: TensorDictModuleBase, env: TransformedRobotEnv, goals: int, seed: int) -> Tensor:
+def evaluate_in_a_row(
+    policy: TensorDictModuleBase, env: TransformedRobotEnv, goals: int, seed: int
+) -> tuple[Tensor, Tensor]:
     """Give each robot goals one after the other, and never bring it home in between.
 
     What one episode hides shows here: an arm that turns into its joint limits, goal by goal.
@@ -173,16 +176,22 @@ def evaluate_in_a_row(policy: TensorDictModuleBase, env: TransformedRobotEnv, go
         seed: Seeds goals, starts, and whatever the env randomizes.
 
     Returns:
-        Whether the robots succeeded, [E, G].
+        Whether the robots succeeded, [E, G]; and the share of time that each joint was within ``NEAR_LIMIT`` of one of
+        its limits, [n].
     """
     env.set_seed(seed)
+    low, high = env.simulation.spec.position_limit.T
+    near, steps = np.zeros(len(low)), 0
     tensordict, robots = env.reset(), env.simulation.num_envs
     success, played = torch.zeros(robots, goals, dtype=torch.bool), torch.zeros(robots, dtype=torch.int64)
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         while (played < goals).any():
             after, tensordict = env.step_and_maybe_reset(policy(tensordict))
             after = after.get("next")
+            position, going_on = env.simulation.state.joint_position, (played < goals).numpy()
+            at_limit = (position < low + NEAR_LIMIT) | (position > high - NEAR_LIMIT)
+            near, steps = near + at_limit[going_on].sum(axis=0), steps + int(going_on.sum())
             ended = (after.get("done")[:, 0] & (played < goals)).nonzero()[:, 0]
             success[ended, played[ended]] = after.get("success")[ended, 0]
             played[ended] += 1
-    return success
+    return success, torch.from_numpy(near / steps)

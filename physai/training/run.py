@@ -211,11 +211,17 @@ class TrainedPolicy:
         carried = self.config.env.model_copy(update={"start": start})
         actor, env = self.deploy(ROBOTS_IN_A_ROW, seed, carried)
         try:
-            success = evaluate_in_a_row(actor, env, goals, seed)
+            success, near_limit = evaluate_in_a_row(actor, env, goals, seed)
         finally:
             env.close()
         rate = float(success.double().mean())
-        return {"in_a_row": goals, "in_a_row_rate": rate, "in_a_row_ci": list(wilson(success))}
+        joints = zip(carried.robot.joints, near_limit.tolist(), strict=True)
+        return {
+            "in_a_row": goals,
+            "in_a_row_rate": rate,
+            "in_a_row_ci": list(wilson(success)),
+            "in_a_row_near_limit": dict(joints),
+        }
 
 
 def _summary(config: TrainConfig, trainer: Trainer, best_frames: int, figures: dict[str, Any]) -> dict[str, Any]:
@@ -259,6 +265,8 @@ def print_summary(summary: dict[str, Any], title: str) -> None:
     rows = {"success rate": rate(summary, "success"), "settled": rate(summary, "settled")}
     if "in_a_row" in summary:
         rows[f"{summary['in_a_row']} in a row"] = rate(summary, "in_a_row")
+        joint, share = max(summary["in_a_row_near_limit"].items(), key=lambda item: item[1])
+        rows["near a limit"] = f"{share:.1%} of that time" + (f", {joint}" if share else "")
     rows |= {
         "steps to goal": "none reached" if steps is None else f"{steps:.1f}",
         "final distance": f"{summary['final_distance']:.3f} {summary['distance_unit']}",

@@ -147,12 +147,31 @@ def test_in_a_row_each_robot_begins_where_it_ended_and_every_goal_counts(env_con
             moved.append(abs(env.simulation.state.joint_position - before).max())
 
     env.simulation._begin = begin
-    success = evaluate_in_a_row(Swing(stays=True), env, 5, seed=3)
+    success, near_limit = evaluate_in_a_row(Swing(stays=True), env, 5, seed=3)
     env.close()
     assert success.shape == (16, 5)
     assert success.double().mean() > 0.9
     assert len(moved) >= 5
     assert max(moved) < 1e-6
+    assert near_limit[0] == 0.0  # it turns without end
+
+
+class Push(TensorDictModuleBase):
+    """Turns every joint one way."""
+
+    in_keys, out_keys = ["features"], ["action"]
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        return tensordict.set("action", torch.tensor([[1.0, 0.0]]).expand(len(tensordict["features"]), 2))
+
+
+@pytest.mark.slow
+def test_time_near_a_joint_limit_shows_for_the_joint_that_is_there():
+    env = make("kuka_reacher", 4, overrides=["randomization=none", "env.start.carried_over=1.0"])
+    _, near_limit = evaluate_in_a_row(Push(), env, 4, seed=3)
+    env.close()
+    assert near_limit[0] > 0.5
+    assert near_limit[1] == 0.0
 
 
 def test_failures_of_one_robot_widen_the_interval_for_they_depend_on_each_other():
