@@ -87,7 +87,7 @@ class CommandWatchdog(StoppableNode[WatchdogConfig]):
         self._look()
         heard = self._commands.unheard is None
         # The zeros of the check before: a controller that missed the beginning of a motion would jump into it.
-        arrived = self._commands.arrived
+        arrived = self._source is None and self._commands.arrived
         if self._conflict:
             self._stop(self._conflict)
         elif time.monotonic() - self._last > self.config.timeout:
@@ -96,7 +96,7 @@ class CommandWatchdog(StoppableNode[WatchdogConfig]):
         passing = time.monotonic() >= self._deaf_until and not self._conflict
         if passing and self._source is not None and self._source.get_publisher_count():
             self._heartbeat.publish(Empty())
-        if heard and self._source is None and arrived:
+        if heard and arrived:
             self._source = self.create_subscription(
                 Float64MultiArray,
                 "~/commands",
