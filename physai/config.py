@@ -70,7 +70,7 @@ def nearest(name: str, options: Iterable[str]) -> str:
         close = [by_last[last] for last in difflib.get_close_matches(name.rpartition(".")[2], by_last, n=1)]
     if close:
         return f"; did you mean '{close[0]}'?"
-    return f"; there are: {', '.join(options)}" if 0 < len(options) <= 12 else ""
+    return f"; there are: {', '.join(options)}" if 0 < len(options) <= 16 else ""
 
 
 def not_installed(module: str) -> str:

@@ -87,6 +87,7 @@ def _evaluate(node: DictConfig, _: Path) -> None:
     output = Path(config.run) / f"evaluation_{'_'.join(names)}.json"
     write_atomically(output, json.dumps(summary, indent=2).encode())
     print_summary(summary, f"{config.run}: {config.checkpoint}, on {config.episodes:,} goals")
+    print(f"Written to {output}, in place of earlier figures of the same name.")
 
 
 if __name__ == "__main__":

@@ -1,10 +1,10 @@
 """What a policy file says about itself, for people."""
 
 import hashlib
-import json
 from pathlib import Path
 from typing import Any
 
+from omegaconf import OmegaConf
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
@@ -25,7 +25,8 @@ def show(path: Path) -> None:
     """
     metadata = _read_onnx(path) if path.suffix == ".onnx" else read_metadata(path)
     console = Console()
-    console.print("Config:", json.dumps(metadata.raw["config"]), highlight=False, markup=False, soft_wrap=True)
+    config = OmegaConf.to_yaml(OmegaConf.create(metadata.raw["config"]))
+    console.print(config, highlight=False, markup=False, soft_wrap=True)
     try:
         console.print(_summary(path, metadata))
     except (KeyError, TypeError, ValueError) as error:  # of the parts that no robot needs
@@ -55,7 +56,7 @@ def _summary(path: Path, metadata: Metadata) -> Table:
         "outputs": _shapes(metadata.outputs),
         "control rate": f"{metadata.control_rate:g} Hz",
         "goals": _goals(metadata),
-        "evaluation": f"on {evaluation['episodes']:,} goals, randomization {evaluation['randomization']}",
+        "driven by this file": f"{evaluation['episodes']:,} goals, randomization {evaluation['randomization']}",
         "success": rate(evaluation, "success"),
         "settled": rate(evaluation, "settled"),
         **_transfer(evaluation["transfer"]),

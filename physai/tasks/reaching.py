@@ -10,6 +10,7 @@ from physai.signals import Tolerance
 from physai.tasks.interface import Step, Task
 
 _NEAR = 0.02  # what being all but in touch costs in a step, as a share of a collision
+_SOFT = 0.2  # rad: nearer to a limit than this costs
 
 
 class Reaching(Task):
@@ -22,9 +23,12 @@ class Reaching(Task):
         success_reward: Bonus for success, in each step of it.
         success_ends: Whether success ends the episode; else a policy learns to stay there until time is up.
         settle: How long the end effector must stay there to succeed, s; with 0 touching the goal is enough.
-        smoothness: Weight of what changes of the action cost: their mean over the joints, as a share of the action.
+        smoothness: Weight of what changes of the action cost: the mean over the joints of their squares, where 1 is
+            a joint's largest command. Squares make one large step dearer than two small ones.
         posture: Weight of what being away from home costs: the mean over the joints of the square of
             the distance, as a share of half the joint's range. It keeps an arm from winding up into its limits.
+        joint_limits: Weight of being near a joint limit: the sum over the joints of a cost that grows from 0 at 0.2 rad
+            to 1 at the limit. A mean of squares lets a joint that hardly matters lie at its limit.
         collision: What touching itself, the floor or a box costs, which ends the episode; 0: nothing is looked at.
         safe_distance: Nearer than this, m, costs a share of ``collision`` in each step.
         floor: Its height in the base frame, m; None where there is none.
@@ -45,6 +49,7 @@ class Reaching(Task):
         settle: NonNegativeFloat,
         smoothness: NonNegativeFloat,
         posture: NonNegativeFloat,
+        joint_limits: NonNegativeFloat,
         collision: NonNegativeFloat,
         safe_distance: PositiveFloat,
         floor: float | None,
@@ -55,7 +60,7 @@ class Reaching(Task):
         self.max_steps = max_steps
         self._weights = weights
         self._success_reward, self._success_ends, self._settle = success_reward, success_ends, settle
-        self._smoothness, self._posture = smoothness, posture
+        self._smoothness, self._posture, self._joint_limits = smoothness, posture, joint_limits
         self._collision, self._safe_distance = collision, safe_distance
         if collision:
             if spec.collision is None:
@@ -64,7 +69,7 @@ class Reaching(Task):
                     f"robot={spec.name} fits them"
                 )
             self.surroundings = spec.collision.within(floor, boxes)
-        self._home = spec.home
+        self._home, self._position_limit = spec.home, spec.position_limit.T
         self._half_range = (spec.position_limit[:, 1] - spec.position_limit[:, 0]) / 2
 
     def success(self, step: Step) -> np.ndarray:
@@ -88,10 +93,14 @@ class Reaching(Task):
         }
         terms["success"] = self._success_reward * success
         if self._smoothness:
-            terms["smoothness"] = -self._smoothness * np.abs(step.action - step.last_action).mean(axis=1)
+            terms["smoothness"] = -self._smoothness * np.square(step.action - step.last_action).mean(axis=1)
         if self._posture:
             away = (step.state.joint_position - self._home) / self._half_range
             terms["posture"] = -self._posture * np.square(away).mean(axis=1)
+        if self._joint_limits:
+            position, (low, high) = step.state.joint_position, self._position_limit
+            room = np.minimum(position - low, high - position)
+            terms["joint_limits"] = -self._joint_limits * np.clip(1.0 - room / _SOFT, 0.0, 1.0).sum(axis=1)
         if step.clearance is not None:
             near = np.clip(1.0 - step.clearance / self._safe_distance, 0.0, 1.0)
             terms["collision"] = -self._collision * np.where(step.clearance <= 0, 1.0, _NEAR * near)

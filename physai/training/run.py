@@ -8,6 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import torch
 from omegaconf import DictConfig
 from rich.console import Console
 from rich.table import Table
@@ -186,6 +187,7 @@ class TrainedPolicy:
     ) -> tuple[TensorDictModuleBase, TransformedRobotEnv]:
         """Build the actor, and an env with the statistics that it was trained with; the run's, if no other is given."""
         config = self.config if env_config is None else self.config.model_copy(update={"env": env_config})
+        torch.set_num_threads(config.threads)  # with more, threads wait for each other longer than they compute
         env = make_evaluation_env(config, randomization or self.randomization, num_envs, seed)
         try:
             actor = make_actor(config, env)

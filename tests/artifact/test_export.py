@@ -210,7 +210,7 @@ def test_inspect_shows_it_to_people(exported_run, capsys, monkeypatch, name):
         "inner 0.3, outer 0.53",
         "success",
         "torchrl",
-        '"clip": 10.0',
+        "clip: 10.0",
     ):
         assert part in shown
 

@@ -20,7 +20,8 @@ def reach(config, goal_radius=RADII) -> Reach:
     """The task of an env's robot."""
     spec = RobotSpec.from_config(config.robot)
     rest = {"tolerance": 0.05, "success_reward": 10.0, "success_ends": True, "settle": 0.0, "max_steps": 200}
-    rest |= {"smoothness": 0.0, "posture": 0.0, "collision": 0.0, "safe_distance": 0.01, "floor": None, "boxes": []}
+    rest |= dict.fromkeys(("smoothness", "posture", "joint_limits", "collision"), 0.0)
+    rest |= {"safe_distance": 0.01, "floor": None, "boxes": []}
     return Reach(spec, ForwardKinematics(spec), goal_radius, **rest)
 
 
@@ -281,8 +282,8 @@ def test_with_settle_success_is_to_have_stayed(simulate):
         assert task.terminated(step, task.success(step)) == success
 
 
-def test_smoothness_costs_what_the_action_changes_by(simulate):
+def test_smoothness_costs_the_square_of_what_the_action_changes_by(simulate):
     plain, smooth = (simulate(f"env.task.smoothness={value}", robots=1).task for value in (0.0, 0.3))
     step = held_for(smooth, 0.0, action=0.5)
     assert set(plain.rewards(step, np.zeros(1, bool))) == {"distance", "success"}
-    assert smooth.rewards(step, np.zeros(1, bool))["smoothness"] == pytest.approx(-0.15)
+    assert smooth.rewards(step, np.zeros(1, bool))["smoothness"] == pytest.approx(-0.075)

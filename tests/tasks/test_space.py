@@ -9,6 +9,7 @@ from physai.envs.simulation import Simulation
 from physai.errors import UserError
 from physai.physics import RobotState
 from physai.signals import Quantity
+from physai.tasks import Step
 
 SPACE = ["panda_reach", "panda_pose", "kuka7_reach", "xarm_reach"]
 
@@ -156,6 +157,16 @@ def test_a_posture_away_from_home_costs_by_the_joint_s_range(simulate):
     )
     paid = simulation.episode_rewards[:, simulation.reward_terms.index("posture")]
     np.testing.assert_allclose(paid, -0.3 * (away**2).mean(axis=1), rtol=1e-5)
+
+
+def test_each_joint_near_a_limit_costs_by_how_near_it_is(simulate):
+    task = simulate("panda_reach").task
+    low, high = simulate("panda_reach").spec.position_limit.T
+    at = np.tile((low + high) / 2, (4, 1))
+    at[1, 4], at[2, 4], at[3, [0, 4]] = low[4] + 0.1, high[4] + 0.01, (low[0], high[4])
+    one = np.zeros((4, 7))
+    step = Step(RobotState(at, one), one, one, one, np.zeros((4, 3)), np.zeros((4, 1)), np.zeros(4), None)
+    np.testing.assert_allclose(task.rewards(step, np.zeros(4, bool))["joint_limits"], [0.0, -0.05, -0.1, -0.2])
 
 
 def test_an_episode_that_would_begin_in_a_collision_begins_at_home(simulate):
