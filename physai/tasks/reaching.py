@@ -10,7 +10,7 @@ from physai.signals import Tolerance
 from physai.tasks.interface import Step, Task
 
 _NEAR = 0.02  # what being all but in touch costs in a step, as a share of a collision
-_SOFT = 0.2  # rad: nearer to a limit than this costs
+_SOFT = 0.9  # of the way from the middle of a joint's range to a limit: beyond, it costs
 
 
 class Reaching(Task):
@@ -27,8 +27,9 @@ class Reaching(Task):
             a joint's largest command. Squares make one large step dearer than two small ones.
         posture: Weight of what being away from home costs: the mean over the joints of the square of
             the distance, as a share of half the joint's range. It keeps an arm from winding up into its limits.
-        joint_limits: Weight of being near a joint limit: the sum over the joints of a cost that grows from 0 at 0.2 rad
-            to 1 at the limit. A mean of squares lets a joint that hardly matters lie at its limit.
+        joint_limits: Weight of being near a joint limit: the sum over the joints of a cost that grows from 0 to 1
+            over the last tenth of the way from the middle of the range. A mean, as in ``posture``, lets a joint that
+            hardly matters lie at its limit.
         collision: What touching itself, the floor or a box costs, which ends the episode; 0: nothing is looked at.
         safe_distance: Nearer than this, m, costs a share of ``collision`` in each step.
         floor: Its height in the base frame, m; None where there is none.
@@ -69,7 +70,8 @@ class Reaching(Task):
                     f"robot={spec.name} fits them"
                 )
             self.surroundings = spec.collision.within(floor, boxes)
-        self._home, self._position_limit = spec.home, spec.position_limit.T
+        self._home = spec.home
+        self._middle = np.nan_to_num(spec.position_limit).mean(axis=1)  # 0 where a joint turns without end
         self._half_range = (spec.position_limit[:, 1] - spec.position_limit[:, 0]) / 2
 
     def success(self, step: Step) -> np.ndarray:
@@ -98,9 +100,8 @@ class Reaching(Task):
             away = (step.state.joint_position - self._home) / self._half_range
             terms["posture"] = -self._posture * np.square(away).mean(axis=1)
         if self._joint_limits:
-            position, (low, high) = step.state.joint_position, self._position_limit
-            room = np.minimum(position - low, high - position)
-            terms["joint_limits"] = -self._joint_limits * np.clip(1.0 - room / _SOFT, 0.0, 1.0).sum(axis=1)
+            way = np.abs(step.state.joint_position - self._middle) / self._half_range
+            terms["joint_limits"] = -self._joint_limits * np.clip((way - _SOFT) / (1.0 - _SOFT), 0.0, 1.0).sum(axis=1)
         if step.clearance is not None:
             near = np.clip(1.0 - step.clearance / self._safe_distance, 0.0, 1.0)
             terms["collision"] = -self._collision * np.where(step.clearance <= 0, 1.0, _NEAR * near)
