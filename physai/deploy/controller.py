@@ -5,6 +5,7 @@ import operator
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -217,8 +218,8 @@ class Controller:
             reasons.append(self._hold("clock", f"the clock jumped by {elapsed:.3f} s"))
             return 0.0, True
         if elapsed > LATE * self._period:
-            self._counters["late updates"] += 1
-            reasons.append(f"update came after {elapsed:.3f} s, {elapsed / self._period:.1f} periods")
+            late = f"update came after {elapsed:.3f} s, {elapsed / self._period:.1f} periods"
+            self._tell(reasons, "late updates", late)
             return elapsed, True
         return elapsed, False
 
@@ -227,13 +228,11 @@ class Controller:
             project = self.config.unreachable_goal == "project"
             new, projected = accept(goal, self.policy.metadata, project, self._guard.inside)
         except GoalError as rejected:
-            self._counters[f"goals rejected: {rejected.kind}"] += 1
-            reasons.append(str(rejected))
+            self._tell(reasons, f"goals rejected: {rejected.kind}", str(rejected))
             return
         self._counters["goals"] += 1
         if projected:
-            self._counters["goals projected"] += 1
-            reasons.append(f"goal out of reach: {new.tolist()} is the nearest in reach")
+            self._tell(reasons, "goals projected", f"goal out of reach: {new.tolist()} is the nearest in reach")
         if self._goal is None or np.abs(new - self._goal).max() > _MOVED * self._tolerances[0]:
             self._reached, self._gave_up = False, ""
             self._progress.restart()
@@ -249,8 +248,7 @@ class Controller:
             self._take_motion(heard, reasons)
         except (JointStateError, AttributeError) as error:
             rejected = error if isinstance(error, JointStateError) else JointStateError("malformed", "it is none")
-            self._counters[f"states rejected: {rejected.kind}"] += 1
-            reasons.append(str(rejected))
+            self._tell(reasons, f"states rejected: {rejected.kind}", str(rejected))
             if rejected.implausible:
                 self._hold(rejected.kind, str(rejected))
             elif self._needed:
@@ -271,8 +269,7 @@ class Controller:
                 kind, what = "another source", f"'{heard.another}' is told by another source than before"
             self._hold(kind, what)
             if self._goal is not None:
-                self._counters[f"goals forgotten: {kind}"] += 1
-                reasons.append(f"goal forgotten: {self._hold_reason}")
+                self._tell(reasons, f"goals forgotten: {kind}", f"goal forgotten: {self._hold_reason}")
                 self.forget_goal()
         self._check_position()
         if self._received == -math.inf:
@@ -350,18 +347,20 @@ class Controller:
         self._failures = 0
         wanted = self._interface.wanted(answer)
         if self._limits.out_of_range(wanted, self._interface.rounding):
-            self._counters["commands clamped"] += 1
-            reasons.append("the policy's command was beyond its range")
-        velocity, held_back = self._limits.apply(wanted, robot.position, target, self._interface.velocity, elapsed)
+            self._tell(reasons, "commands clamped", "the policy's command was beyond its range")
+        limited = partial(
+            self._limits.apply, position=robot.position, target=target, last=self._interface.velocity, elapsed=elapsed
+        )
+        velocity, held_back = limited(wanted)
         if held_back is not None:
-            self._counters["ticks at a position limit"] += 1
-            reasons.append(held_back)
-        if (nearing := self._guard.held_back(robot.position, velocity)) is not None:
-            self._counters["ticks held back by the collision guard"] += 1
-            reasons.append(nearing)
-            self._guarded, self._hold_reason = True, nearing
+            self._tell(reasons, "ticks at a position limit", held_back)
+        safe, nearing = self._guard.apply(velocity, robot.position, limited)
+        if nearing is not None:
+            self._tell(reasons, "ticks held back by the collision guard", nearing)
+        if safe is None:
+            self._guarded, self._hold_reason = True, str(nearing)
             return None, self._asked.nothing
-        return velocity, self._remember(memory, elapsed)
+        return safe, self._remember(memory, elapsed)
 
     def _send(self, velocity: np.ndarray | None, elapsed: float, reasons: list[str]) -> np.ndarray | None:
         """Return what makes the robot go on with a velocity, or stand; None where that is not known yet."""
@@ -369,18 +368,20 @@ class Controller:
             return self._interface.stand(self._robot.position)
         value, waits = self._interface.drive(velocity, elapsed)
         if waits is not None:
-            self._counters["ticks at max_lead"] += 1
-            reasons.append(waits)
+            self._tell(reasons, "ticks at max_lead", waits)
         return value
 
+    def _tell(self, reasons: list[str], event: str, reason: str) -> None:
+        self._counters[event] += 1
+        reasons.append(reason)
+
     def _give_up(self, error: list[float], reasons: list[str]) -> tuple[None, np.ndarray]:
-        self._counters["holds: no progress"] += 1
         tolerances = self.policy.metadata.tolerances
         far = ", ".join(f"{each:.3f} {tolerance.unit}" for each, tolerance in zip(error, tolerances, strict=True))
         self._gave_up = self._hold_reason = (
             f"no progress for {self.config.progress_timeout:g} s, {far} from the goal: waiting for another"
         )
-        reasons.append(self._gave_up)
+        self._tell(reasons, "holds: no progress", self._gave_up)
         return None, self._asked.nothing
 
     def _remember(self, memory: np.ndarray, elapsed: float) -> np.ndarray:
@@ -392,9 +393,8 @@ class Controller:
         return memory
 
     def _policy_failed(self, failure: AnswerError, reasons: list[str]) -> tuple[None, np.ndarray]:
-        self._counters[f"policy failures: {failure.kind}"] += 1
+        self._tell(reasons, f"policy failures: {failure.kind}", f"the policy {failure}")
         self._failures += 1
-        reasons.append(f"the policy {failure}")
         if self._failures >= self.config.policy_failures:
             self._fault("policy", f"the policy failed {self._failures} times in a row; at last it {failure}")
         return None, self._asked.nothing

@@ -19,7 +19,7 @@ def of_joints(name, quantity, joints):
     return Signal.of_joints(name, Quantity(quantity), joints, -most, most)
 
 
-def policy_file(module, joints, inputs, outputs, region, tolerances, collision=None) -> bytes:
+def policy_file(module, joints, inputs, outputs, region, tolerances, collision=None, home=None) -> bytes:
     """A policy file of a module: joints within 3 rad, commands of 2 rad/s, at 50 Hz."""
     n, scripted = len(joints), torch.jit.script(module.eval())
     draw = torch.Generator().manual_seed(0)
@@ -28,11 +28,12 @@ def policy_file(module, joints, inputs, outputs, region, tolerances, collision=N
     columns = zip(*(answer if isinstance(answer, tuple) else (answer,) for answer in answers), strict=True)
     golden |= {signal.name: torch.cat(column) for signal, column in zip(outputs, columns, strict=True)}
     golden["error"] = scripted.error(golden["joint_position"], golden["goal"])
+    home = [0.0] * n if home is None else list(home)
     people = {"checkpoint": {}, "evaluation": {}, "config": {}, "versions": {}, "created": ""}
     raw = people | {
         "format": FORMAT,
         "format_version": FORMAT_VERSION,
-        "robot": {"name": "arm", "joints": list(joints), "home": [0.0] * n, "end_effector": "", "urdf_sha256": ""},
+        "robot": {"name": "arm", "joints": list(joints), "home": home, "end_effector": "", "urdf_sha256": ""},
         "inputs": [describe_signal(signal) for signal in inputs],
         "outputs": [describe_signal(signal) for signal in outputs],
         "limits": {"position": [[-3.0, 3.0]] * n, "velocity": [LIMIT] * n, "effort": [9.0] * n, "command": [LIMIT] * n},

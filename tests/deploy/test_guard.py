@@ -9,6 +9,7 @@ from physai.collision import Box
 from physai.compose import compose
 from physai.config import validate
 from physai.deploy import Controller, ControllerConfig, Goal, JointState, State, load_policy
+from physai.deploy.guard import CollisionGuard
 from physai.envs.simulation import EnvConfig
 from physai.errors import UserError
 from physai.physics import RobotState
@@ -63,7 +64,7 @@ def policies(panda, tmp_path_factory):
     loaded = []
     for collision in (panda.collision, None):
         path = tmp_path_factory.mktemp("policy") / "policy.pt"
-        path.write_bytes(policy_file(*parts, collision))
+        path.write_bytes(policy_file(*parts, collision, panda.home))
         loaded.append(load_policy(path))
     return loaded
 
@@ -113,8 +114,8 @@ def folded(panda):
     "`stopping_time` (0.12 s)"
 )
 def test_what_it_holds_back_it_says_by_the_names_of_both_links_and_away_is_free(policies, panda):
-    visited, controller = drive(policies[0], panda, {}, 110, goals=[folded(panda)])
-    now = 110 * DT
+    visited, controller = drive(policies[0], panda, {}, 400, goals=[folded(panda)])
+    now = 400 * DT
     assert controller.snapshot()["state"] == State.HOLD.value
     reason = controller.snapshot()["reasons"][-1]
     assert "would come within" in reason
@@ -123,6 +124,37 @@ def test_what_it_holds_back_it_says_by_the_names_of_both_links_and_away_is_free(
     home = controller.update(now, heard, Goal(panda.home, names=panda.joints))
     assert home.state is State.ACTIVE
     assert np.abs(home.value).max() > 0.0
+
+
+def test_an_arm_slides_past_what_is_on_the_side_of_its_way(policies, panda):
+    post = (0.316, 0.173, 0.42, 0.06, 0.06, 0.06)  # the hand hits its upper edge as the arm turns
+    beyond = panda.home + np.eye(7)[0]
+    judge = ShapeCollisions(panda, boxes=[Box("post", post[:3], post[3:])])
+    free, _ = drive(policies[0], panda, {}, 200, goals=[beyond])
+    past, controller = drive(policies[0], panda, {"boxes": post}, 300, goals=[beyond])
+    assert judge.touching(free).any()
+    assert not judge.touching(past).any()
+    assert controller.snapshot()["state"] == State.REACHED.value
+    assert controller.snapshot()["counters"]["ticks held back by the collision guard"] > 10
+    judge.close()
+
+
+def test_what_stands_in_the_middle_of_the_way_stops_the_arm(policies, panda):
+    visited, controller = drive(policies[0], panda, {}, 400, goals=[folded(panda)])
+    assert controller.snapshot()["state"] == State.HOLD.value
+    assert np.abs(np.diff(visited[-20:], axis=0)).max() < 1e-3
+    assert panda.collision.distance(visited).min() > 0.0
+
+
+def test_neighbours_that_are_always_close_may_come_closer_than_the_margin(policies, panda):
+    guard, names = CollisionGuard(policies[0].metadata, ControllerConfig()), panda.collision.names
+    at_home = panda.collision.distance(panda.home[None])[0]
+    assert {names[row] for row in np.flatnonzero(at_home < 0.02)} == {("panda_link5", "panda_link7")}
+    position, fold = panda.home.copy(), np.eye(7)[5] * -0.01  # joint 6
+    while guard.held_back(position, fold) is None:
+        position += fold
+    assert 0.0 < panda.collision.distance(position[None]).min() < 0.01
+    assert position[5] < panda.home[5] - 0.3
 
 
 def test_boxes_and_floor_are_kept_clear_of(policies, panda):

@@ -166,7 +166,9 @@ def test_each_joint_near_a_limit_costs_by_how_near_it_is(simulate):
     at[1, 4], at[2, 4], at[3, [0, 4]] = 0.95 * low[4], high[4] + 0.01, (low[0], high[4])
     one = np.zeros((4, 7))
     step = Step(RobotState(at, one), one, one, one, np.zeros((4, 3)), np.zeros((4, 1)), np.zeros(4), None)
-    np.testing.assert_allclose(task.rewards(step, np.zeros(4, bool))["joint_limits"], [0.0, -0.15, -0.3, -0.6], rtol=1e-5)
+    np.testing.assert_allclose(
+        task.rewards(step, np.zeros(4, bool))["joint_limits"], [0.0, -0.15, -0.3, -0.6], rtol=1e-5
+    )
 
 
 def test_an_episode_that_would_begin_in_a_collision_begins_at_home(simulate):
