@@ -4,7 +4,7 @@ import hashlib
 from pathlib import Path
 from typing import Any
 
-from omegaconf import OmegaConf
+import yaml
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
@@ -25,7 +25,7 @@ def show(path: Path) -> None:
     """
     metadata = _read_onnx(path) if path.suffix == ".onnx" else read_metadata(path)
     console = Console()
-    config = OmegaConf.to_yaml(OmegaConf.create(metadata.raw["config"]))
+    config = yaml.safe_dump(metadata.raw["config"], sort_keys=False)
     console.print(config, highlight=False, markup=False, soft_wrap=True)
     try:
         console.print(_summary(path, metadata))
