@@ -47,7 +47,8 @@ def pytest_runtest_protocol(item: pytest.Item, nextitem: pytest.Item | None) -> 
         stall = item.config.stash[STALLS].longest(since=began) if failed and attempt < ATTEMPTS else 0.0
         if stall == 0.0:
             break
-        reason = next(str(report.longrepr).splitlines()[-1] for report in reports if report.failed)
+        crash = next(getattr(report.longrepr, "reprcrash", report.longrepr) for report in reports if report.failed)
+        reason = str(getattr(crash, "message", crash)).splitlines()[0]
         item.config.stash[REPEATED].append(f"{item.nodeid}: {reason}, and a stall of {stall:.2f} s")
         item._initrequest()  # fixtures of its own
     for report in reports:

@@ -6,7 +6,6 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.clock import Clock, ClockType
 from rclpy.qos import QoSProfile
 from sensor_msgs.msg import JointState
@@ -81,13 +80,10 @@ class Loop:
         peer: Hears everything.
         arm: The robot.
         node: The inference node's process.
-        diagnostics: (time, level, message, values) of every /diagnostics.
     """
 
     def __init__(self, peer: Peer, node: Process, profile: QoSProfile | int, rate: float) -> None:
         self.peer, self.node = peer, node
-        self.diagnostics: list[tuple[float, bytes, str, dict[str, str]]] = []
-        self.peer.listen(DiagnosticArray, "/diagnostics", self.diagnostics, 10)
         self.arm = Arm(self.peer, profile, rate)
 
     def diagnosis(self, after: float | None = None) -> tuple[int, str, dict[str, str]]:
@@ -95,7 +91,7 @@ class Loop:
         after = time.monotonic() if after is None else after
 
         def there() -> Any:
-            return self.diagnostics[-1] if self.diagnostics and self.diagnostics[-1][0] > after else None
+            return self.peer.diagnostics[-1] if self.peer.diagnostics and self.peer.diagnostics[-1][0] > after else None
 
         status = wait_for(there, what="/diagnostics")[1].status[0]
         return status.level[0], status.message, {item.key: item.value for item in status.values}

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PointStamped
 from rcl_interfaces.msg import SetParametersResult
 from rcl_interfaces.srv import SetParameters
@@ -134,6 +135,7 @@ class Peer:
         commands: (time, velocities) of every command on the controller's topic.
         states: (time, text) of the inference node's ``~/state``.
         joint_states: (time, message).
+        diagnostics: (time, message) of every ``/diagnostics``.
     """
 
     def __init__(self, domain: int, listen_to_commands: bool = True) -> None:
@@ -144,11 +146,13 @@ class Peer:
         self.commands: list[tuple[float, list[float]]] = []
         self.states: list[tuple[float, str]] = []
         self.joint_states: list[tuple[float, JointState]] = []
+        self.diagnostics: list[tuple[float, DiagnosticArray]] = []
         if listen_to_commands:
             # Deep, so that no command is missed; a controller would only look at the last.
             self.listen(Float64MultiArray, TOPIC, self.commands, 1000, lambda message: message.data.tolist())
         self.listen(String, "/inference_node/state", self.states, qos.LATCHED, lambda message: message.data)
         self.listen(JointState, "/joint_states", self.joint_states, 10)
+        self.listen(DiagnosticArray, "/diagnostics", self.diagnostics, 10)
         self._publishers: dict[tuple[Any, ...], Any] = {}
         self._clients: dict[str, Any] = {}
         self._executor = SingleThreadedExecutor(context=self._context)
@@ -226,7 +230,8 @@ class Peer:
         def instead() -> str:
             joints = [(at, list(message.position)) for at, message in self.joint_states[-1:]]
             heard = f"{len(self.commands)} commands, {len(self.joint_states)} joint states"
-            return f"state {names}; had {self.states[-5:]}; {heard}, the last {self.commands[-1:]}, {joints}"
+            told = [status.message for _, message in self.diagnostics[-1:] for status in message.status]
+            return f"state {names}; had {self.states[-5:]}, {told}; {heard}, the last {self.commands[-1:]}, {joints}"
 
         return wait_for(there, timeout, instead)
 

@@ -24,6 +24,7 @@ def reach_goal_after_goal(start, peer, policy_path):
     assert max(abs(v) for _, command in peer.commands for v in command) <= 1.0 + 1e-9
 
 
+@pytest.mark.realtime
 @pytest.mark.slow
 def test_the_arm_reaches_goal_after_goal(start, peer, policy_path):
     reach_goal_after_goal(start, peer, policy_path)
@@ -54,6 +55,7 @@ def test_each_joint_is_commanded_at_its_place_and_one_that_is_not_the_policy_s_s
             peer.close()
 
 
+@pytest.mark.realtime
 @pytest.mark.slow
 def test_with_a_policy_that_remembers_it_does_too(start, peer, recurrent_run):
     reach_goal_after_goal(start, peer, recurrent_run / "policy.pt")

@@ -52,9 +52,9 @@ def test_timing_gives_mean_rate_and_largest_deviation(periods):
 @pytest.mark.realtime
 def test_diagnostics_come_every_second_and_with_every_change(loop, policy_path):
     loop.rest()
-    seen = len(loop.diagnostics)
-    wait_for(lambda: len(loop.diagnostics) >= seen + 6)  # the first ones may be of a change
-    times = [at for at, _ in loop.diagnostics[seen + 2 :]]
+    seen = len(loop.peer.diagnostics)
+    wait_for(lambda: len(loop.peer.diagnostics) >= seen + 6)  # the first ones may be of a change
+    times = [at for at, _ in loop.peer.diagnostics[seen + 2 :]]
     assert all(0.7 < b - a < 1.3 for a, b in itertools.pairwise(times)), times
     loop.start_from_here()
     changed, _ = loop.peer.wait_state("active")
@@ -85,7 +85,7 @@ def test_diagnostics_come_every_second_and_with_every_change(loop, policy_path):
     stopped, _ = loop.peer.wait_state("estop", after=since)
     level, message, values = loop.diagnosis(after=stopped - 0.001)
     assert (level, message) == (2, "estop: emergency stop")
-    status = loop.diagnostics[-1][1].status[0]
+    status = loop.peer.diagnostics[-1][1].status[0]
     assert (status.name, status.hardware_id) == ("inference_node: arm", "planar_arm")
 
 
