@@ -39,6 +39,9 @@ class CapsulesConfig(Config):
 
 
 def _check(node: DictConfig) -> None:
+    if "robot" not in node:
+        known = sorted(path.stem for path in (conf_dir() / "robot").glob("*.yaml"))
+        raise UserError(f"say which robot, as in robot=panda; there are {', '.join(known)}")
     config = validate(CapsulesConfig, node)
     if config.path.suffix != ".yaml":
         raise UserError(f"output: '{config.output}' must end in .yaml")

@@ -6,6 +6,7 @@ import gc
 import importlib.util
 import itertools
 import os
+import select
 import shutil
 import signal
 import socket
@@ -99,6 +100,8 @@ def guard() -> Iterator[None]:
     except KeyboardInterrupt:
         sys.exit(130)
     except (UserError, OSError, ImportError) as error:
+        if isinstance(error, BrokenPipeError) and _nobody_reads():
+            sys.exit(128 + signal.SIGPIPE)
         if os.environ.get("HYDRA_FULL_ERROR") == "1":
             traceback.print_exception(error)
         line = str(error)
@@ -108,6 +111,19 @@ def guard() -> Iterator[None]:
             line = " ".join(line.split())
         print(f"error: {printable(line)}", file=sys.stderr)
         sys.exit(2)
+
+
+def _nobody_reads() -> bool:
+    """Whether the output's reader has gone, as head does after ten lines; what is left of the output is dropped then.
+
+    A shell stops other programs by SIGPIPE then, which Python ignores.
+    """
+    poll = select.poll()
+    poll.register(1, 0)
+    gone = any(event & select.POLLERR for _, event in poll.poll(0))
+    if gone:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+    return gone
 
 
 def printable(text: str) -> str:

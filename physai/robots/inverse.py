@@ -13,7 +13,7 @@ _ARM = 0.3  # m/rad, by which angles count beside lengths
 _BENT = 0.1  # m², by which a pose may be farther whose configuration is nearer to home
 _DAMPING = 3e-3  # m²
 _REFINED = 3  # times
-_TRIED = 2  # configurations a pose
+_TRIED = 3  # configurations a pose
 _BETTER = 1e-3  # m², by which a later one must be: else rounding would choose between two that lead there
 _ROOM = 0.05  # rad, to the joints' limits
 
@@ -23,7 +23,8 @@ class InverseKinematics(nn.Module):
 
     From wherever an arm is, following the way that shortens the error gets it stuck at its joint limits: many poses
     need another way to bend. A configuration that is known to lead near the pose has the right one. From there, steps
-    of damped least squares (Nakamura and Hanafusa, 1986) lead to the pose.
+    of damped least squares (Nakamura and Hanafusa, 1986) lead to the pose. They stay within the ranges of the known
+    configurations: where those keep away from touching anything, a wrist bent farther than all of them may touch.
 
     What it finds follows from the pose alone: an arm that is sent there twice bends the same way twice.
 
@@ -49,8 +50,8 @@ class InverseKinematics(nn.Module):
             "configurations": torch.from_numpy(configurations),
             "places": places.T.contiguous(),
             "lengths": places.square().sum(dim=1) + _BENT * torch.from_numpy(bent),
-            "lower": torch.from_numpy(lower + _ROOM),
-            "upper": torch.from_numpy(upper - _ROOM),
+            "lower": torch.from_numpy(np.maximum(lower + _ROOM, configurations.min(axis=0))),
+            "upper": torch.from_numpy(np.minimum(upper - _ROOM, configurations.max(axis=0))),
             "damping": _DAMPING * torch.eye(6),
             "later": _BETTER * torch.arange(_TRIED),
         }
