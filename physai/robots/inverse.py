@@ -15,6 +15,7 @@ _DAMPING = 3e-3  # m²
 _REFINED = 3  # times
 _TRIED = 3  # configurations a pose
 _BETTER = 1e-3  # m², by which a later one must be: else rounding would choose between two that lead there
+_UNKNOWN = 0.5  # m²/rad², the cost of leaving the ranges of the known ones
 _ROOM = 0.05  # rad, to the joints' limits
 
 
@@ -23,8 +24,9 @@ class InverseKinematics(nn.Module):
 
     From wherever an arm is, following the way that shortens the error gets it stuck at its joint limits: many poses
     need another way to bend. A configuration that is known to lead near the pose has the right one. From there, steps
-    of damped least squares (Nakamura and Hanafusa, 1986) lead to the pose. They stay within the ranges of the known
-    configurations: where those keep away from touching anything, a wrist bent farther than all of them may touch.
+    of damped least squares (Nakamura and Hanafusa, 1986) lead to the pose. Of what they find, the one is taken that is
+    best and within the ranges of the known configurations: where those keep away from touching anything, a wrist that
+    is bent farther than in all of them may touch.
 
     What it finds follows from the pose alone: an arm that is sent there twice bends the same way twice.
 
@@ -40,7 +42,7 @@ class InverseKinematics(nn.Module):
     ) -> None:
         super().__init__()
         self.arm, self.angular = _ARM, _ARM / math.sqrt(2.0)  # TorchScript knows no constants of modules
-        self.refined, self.tried = _REFINED, _TRIED
+        self.refined, self.tried, self.unknown = _REFINED, _TRIED, _UNKNOWN
         self.kinematics = kinematics
         lower, upper = spec.position_limit.T
         bent = np.square((configurations - spec.home) / ((upper - lower) / 2)).mean(axis=1)
@@ -50,8 +52,10 @@ class InverseKinematics(nn.Module):
             "configurations": torch.from_numpy(configurations),
             "places": places.T.contiguous(),
             "lengths": places.square().sum(dim=1) + _BENT * torch.from_numpy(bent),
-            "lower": torch.from_numpy(np.maximum(lower + _ROOM, configurations.min(axis=0))),
-            "upper": torch.from_numpy(np.minimum(upper - _ROOM, configurations.max(axis=0))),
+            "lower": torch.from_numpy(lower + _ROOM),
+            "upper": torch.from_numpy(upper - _ROOM),
+            "least": torch.from_numpy(configurations.min(axis=0)),
+            "most": torch.from_numpy(configurations.max(axis=0)),
             "damping": _DAMPING * torch.eye(6),
             "later": _BETTER * torch.arange(_TRIED),
         }
@@ -60,6 +64,8 @@ class InverseKinematics(nn.Module):
         self.lengths: Tensor
         self.lower: Tensor
         self.upper: Tensor
+        self.least: Tensor
+        self.most: Tensor
         self.damping: Tensor
         self.later: Tensor
         for name, values in buffers.items():
@@ -76,7 +82,9 @@ class InverseKinematics(nn.Module):
             found = found + self.least_squares(jacobian, error)
             found = torch.maximum(torch.minimum(found, self.upper), self.lower)
             error, jacobian = self._linearize(found, position, rotation)
-        worse = error.square().sum(dim=1).view(-1, self.tried) + self.later
+        outside = torch.relu(self.least - found) + torch.relu(found - self.most)
+        worse = error.square().sum(dim=1) + self.unknown * outside.square().sum(dim=1)
+        worse = worse.view(-1, self.tried) + self.later
         best = worse.argmin(dim=1, keepdim=True).unsqueeze(2)
         found = found.view(-1, self.tried, found.shape[1])
         return found.gather(1, best.expand(-1, 1, found.shape[2])).squeeze(1)
