@@ -62,6 +62,8 @@ def parse(path: Path) -> etree._ElementTree:
     for joint in root.findall("joint"):
         _check_numbers(path, joint)
         name = _named(path, joint)
+        if (kind := joint.get("type")) in ("floating", "planar"):
+            raise UserError(f"{path}: joint '{name}' is {kind}: nothing would hold what hangs on it; make it fixed")
         for end in ("parent", "child"):
             element = joint.find(end)
             link = None if element is None else element.get("link")

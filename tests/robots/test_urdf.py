@@ -119,6 +119,7 @@ def test_a_missing_file_in_a_package_is_named():
             replaced('<joint name="joint2" type="revolute">', '<joint name="joint2" type="prismatic">'),
             ["joint2"],
         ),
+        (replaced('type="fixed"', 'type="floating"'), ["tool_mount", "floating", "make it fixed"]),
         (replaced('<origin xyz="0.30 0 0"/>', '<origin xyz="0.30 0"/>'), ["joint2", "origin"]),
         (replaced('<axis xyz="0 0 1"/>', '<axis xyz="0 0 0"/>', 'name="joint2"'), ["joint2", "axis"]),
         (replaced('<link name="tool">', '<link name="link2">'), ["link2"]),
