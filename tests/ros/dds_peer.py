@@ -1,6 +1,7 @@
 """A robot that knows nothing of ROS: another implementation of DDS (Cyclone), which closes the loop until "reached".
 
-Usage: ``python dds_peer.py DOMAIN``. It obeys commands at once, and prints the states that the node announces.
+Usage: ``python dds_peer.py DOMAIN JOINT=POSITION...``. Its joints start there. It obeys commands at once, and prints
+the states that the node announces.
 """
 
 import os
@@ -84,7 +85,9 @@ def main() -> int:
     topic = Topic(participant, "rt/joint_velocity_controller/commands", Float64MultiArray, qos=latest)
     commands = DataReader(participant, topic, qos=latest)
     announced = DataReader(participant, Topic(participant, "rt/inference_node/state", String, qos=latched), qos=latched)
-    position, velocity, said = [0.0, 0.5], [0.0, 0.0], ""
+    places = dict(argument.split("=") for argument in sys.argv[2:])
+    names, position, said = list(places), [float(place) for place in places.values()], ""
+    velocity = [0.0] * len(names)
     due = time.monotonic()
     while said != "reached" or any(velocity):
         for command in commands.take():
@@ -94,7 +97,7 @@ def main() -> int:
             print(f"the node says: {said}", flush=True)
         position = [q + v * PERIOD for q, v in zip(position, velocity, strict=True)]
         stamp = Time(*divmod(time.time_ns(), 10**9))
-        states.write(JointState(Header(stamp, ""), ["joint1", "joint2"], position, velocity, []))
+        states.write(JointState(Header(stamp, ""), names, position, velocity, []))
         due = max(due + PERIOD, time.monotonic() - 5 * PERIOD)
         time.sleep(max(0.0, due - time.monotonic()))
     print(f"standing at {position}", flush=True)
