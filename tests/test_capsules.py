@@ -71,6 +71,16 @@ def test_capsules_are_written_and_drawn_and_a_robot_takes_them(tmp_path, run):
     assert (alarm & ~touching).mean() < 0.08
 
 
+def test_links_that_capsules_cannot_tell_apart_are_left_out_and_named(tmp_path, run):
+    disc = FOOT.replace("<geometry>", '<origin xyz="0 0 {z}" rpy="1.5708 0 0"/><geometry>')
+    path = write_arm(tmp_path, disc.format(z=0.2), "", disc.format(z=0.0), "")
+    path.write_text(path.read_text().replace('<origin xyz="0 0 0.4"/><axis', '<origin xyz="0 0.11 0"/><axis'))
+    code, said, error = run("capsules", *overrides(path, output="found.yaml"))
+    assert code == 0, error
+    assert "Left out: foot and fore, whose capsules overlap nearly always. Their shapes touch in 0.0%" in said
+    assert OmegaConf.load(tmp_path / "found.yaml").pairs == []
+
+
 def test_a_robot_on_which_nothing_can_meet_gets_capsules_without_pairs(tmp_path, run):
     path = write_arm(tmp_path, "", BAR, BAR, "")
     code, _, error = run("capsules", *overrides(path, output="found.yaml"))

@@ -1,5 +1,6 @@
 """Choosing the capsules of a robot, and the pairs of them that can meet, by what PyBullet's shapes say."""
 
+import itertools
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -15,6 +16,7 @@ from physai.robots.shapes import collision_parts
 _DIGITS = 4  # of metres, to which capsules are written
 _FEW = 4000  # of the random configurations, by which capsules are chosen
 _PAIR = 0.001  # the share of false alarms for which one more pair is worth its time
+_NEVER_TOLD = 0.9  # share of the configurations in which shapes are apart; capsules that overlap in more tell nothing
 _PATIENCE = 3  # cuts in a row that are no better, after which no more are tried
 
 
@@ -46,7 +48,9 @@ class CapsuleFit:
     Pairs are chosen as MoveIt's set-up assistant makes its allowed collision matrix: by random configurations. Links
     that a joint joins, that touch always, or that never come near each other are left out. Each link begins with one
     capsule. Then again and again one of the two links that alarm falsely most often, or both, are cut into one more
-    piece, each with its capsule, in the way for which their capsules overlap least where the shapes do not touch.
+    piece, each with its capsule, in the way for which their capsules overlap least where the shapes do not touch. Links
+    whose capsules overlap nearly always, however they are cut, such as a base and the upper arm that turns closely
+    beside it, are left out and named.
 
     Args:
         spec: The robot.
@@ -69,12 +73,12 @@ class CapsuleFit:
             distance = judge.distance(self._joint_position, within=near)
         finally:
             judge.close()
-        self._touching: np.ndarray = np.any(distance <= 0, axis=1)
-        self._pairs = [pair for pair, least in zip(judge.names, distance.min(axis=0), strict=True) if least < near]
+        close = distance.min(axis=0) < near
+        self._touching = dict(zip(itertools.compress(judge.names, close), (distance[:, close] <= 0).T, strict=True))
         self._whole = {link: Piece.of(parts) for link, parts in self.parts.items()}
         self._sliced: dict[tuple[str, int], list[list[Piece]]] = {}
 
-    def fit(self, false_alarms: float, most: int) -> tuple[CollisionConfig, Judged]:
+    def fit(self, false_alarms: float, most: int) -> tuple[CollisionConfig, Judged, dict[tuple[str, str], float]]:
         """Fit.
 
         Args:
@@ -82,8 +86,17 @@ class CapsuleFit:
             most: Number of capsules at most.
 
         Returns:
-            What a robot's YAML holds, and how it compares with the shapes in the configurations that it is made by.
+            What a robot's YAML holds; how it compares with the shapes in the configurations that it is made by; and the
+            pairs of links that are left out, with the share of these configurations in which their shapes touch.
         """
+        best = self._cut(false_alarms, most)
+        untold = {pair: float(self._touching.pop(pair).mean()) for pair in best.untold}
+        if untold:
+            best = self._cut(false_alarms, most)
+        whole = self._made(best.pieces, slice(None))
+        return whole.config, whole.judged, untold
+
+    def _cut(self, false_alarms: float, most: int) -> "_Made":
         few = slice(_FEW)
         best = made = self._made({link: [whole] for link, whole in self._whole.items()}, few)
         in_vain = 0
@@ -91,8 +104,7 @@ class CapsuleFit:
             made = self._refined(made, few)
             better = made.cost < best.cost
             best, in_vain = (made, 0) if better else (best, in_vain + 1)
-        whole = self._made(best.pieces, slice(None))
-        return whole.config, whole.judged
+        return best
 
     def _refined(self, made: "_Made", rows: slice) -> "_Made":
         """Cut one of the two worst links, or both, into one more piece."""
@@ -116,17 +128,24 @@ class CapsuleFit:
         places: dict[str, list[int]] = {link: [] for link in pieces}
         for place, capsule in enumerate(capsules):
             places[capsule.link].append(place)
-        pairs = [[a, b] for first, second in self._pairs for a in places[first] for b in places[second]]
+        pairs = [[a, b] for first, second in self._touching for a in places[first] for b in places[second]]
         distance = self._distance(CollisionConfig(capsules=capsules, pairs=pairs), rows)
         kept = np.flatnonzero(distance.min(axis=0) < self._near)
         config = CollisionConfig(capsules=capsules, pairs=[pairs[place] for place in kept])
-        distance, touching = distance[:, kept], self._touching[rows]
+        distance = distance[:, kept]
+        touching = np.any([each[rows] for each in self._touching.values()] or [np.zeros(len(distance))], axis=0)
         nearest = distance.min(axis=1, initial=np.inf)
         judged = Judged.of(nearest <= 0, touching)
         wrong = ~touching & (nearest <= 0)
         worst = config.pairs[np.bincount(distance[wrong].argmin(axis=1)).argmax()] if wrong.any() else []
         depth = float(-np.where(wrong, nearest, 0.0).mean())
-        return _Made(dict(pieces), config, judged, depth, [capsules[place].link for place in worst])
+        links = np.array([[capsules[place].link for place in pair] for pair in config.pairs]).reshape(-1, 2)
+        untold = []
+        for pair, touches in self._touching.items():
+            nearest = distance[:, (links == pair).all(axis=1)].min(axis=1, initial=np.inf)
+            if (nearest[~touches[rows]] <= 0).mean() > _NEVER_TOLD:
+                untold.append(pair)
+        return _Made(dict(pieces), config, judged, depth, [capsules[place].link for place in worst], untold)
 
     def _distance(self, config: CollisionConfig, rows: slice) -> np.ndarray:
         spec = self._spec
@@ -136,13 +155,20 @@ class CapsuleFit:
 
 @dataclass(frozen=True)
 class _Made:
-    """Capsules so far; ``depth`` is how deep they overlap where shapes do not touch, m, and ``worst`` links do most."""
+    """Capsules so far.
+
+    Attributes:
+        depth: How deep they overlap where shapes do not touch, m.
+        worst: Links that do most.
+        untold: Pairs of links that nearly always do.
+    """
 
     pieces: dict[str, list[Piece]]
     config: CollisionConfig
     judged: Judged
     depth: float
     worst: list[str]
+    untold: list[tuple[str, str]]
 
     @property
     def cost(self) -> float:

@@ -70,6 +70,14 @@ class Reaching(Task):
                     f"robot={spec.name} fits them"
                 )
             self.surroundings = spec.collision.within(floor, boxes)
+            apart = self.surroundings.distance(spec.home[np.newaxis])[0]
+            nearest = apart.argmin()
+            if apart[nearest] <= 0:
+                first, second = self.surroundings.names[nearest]
+                raise UserError(
+                    f"env.robot.home: '{first}' and '{second}' overlap there by {-1e3 * apart[nearest]:.1f} mm: each "
+                    "episode would begin with a collision; move home, env.task.floor or a box, or mend the capsules"
+                )
         self._home = spec.home
         self._middle = np.nan_to_num(spec.position_limit).mean(axis=1)  # 0 where a joint turns without end
         self._half_range = (spec.position_limit[:, 1] - spec.position_limit[:, 0]) / 2

@@ -205,6 +205,7 @@ def test_a_collision_ends_the_episode_and_costs(simulate):
             ["panda_pose", "env.task.region.low=[3,3,3]", "env.task.region.high=[4,4,4]"],
             "only 0 lead, without touching anything, into the box",
         ),
+        (["panda_reach", "env.task.floor=0.4"], "env.robot.home: 'panda_link1' and 'floor' overlap there by"),
     ],
 )
 def test_regions_that_make_no_sense_are_one_line(env_config, overrides, line):
