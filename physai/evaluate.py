@@ -85,9 +85,10 @@ def _evaluate(node: DictConfig, _: Path) -> None:
     chosen = {policy.config.env.name: config.env, engine: config.physics}
     names = [*(name for name, choice in chosen.items() if choice is not None), policy.randomization.name]
     output = Path(config.run) / f"evaluation_{'_'.join(names)}.json"
+    instead = ", in place of earlier figures of the same name" if output.exists() else ""
     write_atomically(output, json.dumps(summary, indent=2).encode())
     print_summary(summary, f"{config.run}: {config.checkpoint}, on {config.episodes:,} goals")
-    print(f"Written to {output}, in place of earlier figures of the same name.")
+    print(f"Written to {output}{instead}")
 
 
 if __name__ == "__main__":

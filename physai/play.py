@@ -1,5 +1,6 @@
 """``python -m physai.play``: watch the policy of a run (see ``--help``)."""
 
+import itertools
 import time
 from contextlib import closing
 from pathlib import Path
@@ -15,7 +16,10 @@ from physai.evaluate import PolicyChoice
 if TYPE_CHECKING:
     import numpy as np
 
-_PAUSE = 15  # frames to look at the arm at its goal
+_PAUSE = 15  # control steps to look at the arm at its goal
+_EACH = (
+    2  # control steps a frame of a video: 25 Hz show as much as 50, and a frame of meshes takes a quarter of a second
+)
 
 
 class PlayConfig(PolicyChoice):
@@ -49,8 +53,12 @@ def _play(node: DictConfig, _: Path) -> None:
     dt = env.simulation.config.control_dt
     frames: list[np.ndarray] = []
 
+    steps = itertools.count()
+
     def show(times: int = 1) -> None:
         for _ in range(times):
+            if not human and next(steps) % _EACH:
+                continue
             image = show_robot(viewer, env.simulation)
             if image is None:
                 time.sleep(dt)
@@ -62,17 +70,22 @@ def _play(node: DictConfig, _: Path) -> None:
         for goal in range(config.goals):
             tensordict = env.reset()
             show()
+            first = None  # s
             while not tensordict["done"].any():
                 tensordict = env.step(actor(tensordict))["next"]
+                seconds = tensordict["episode_length"].item() * dt
+                first = seconds if first is None and tensordict["success"] else first
                 show()
             reached += int(tensordict["success"])
-            outcome = "reached" if tensordict["success"] else "missed"
-            print(f"goal {goal + 1}: {outcome} in {tensordict['episode_length'].item() * dt:.2f} s")
+            outcome = "missed" if first is None else f"reached in {first:.2f} s"
+            if first is not None and first < seconds:
+                outcome += ", held" if tensordict["success"] else ", left again"
+            print(f"goal {goal + 1}: {outcome}", flush=True)
             show(_PAUSE)
     print(f"{reached} of {config.goals} goals reached")
     if not human:
         output = Path(config.output) if config.output else Path(config.run) / "play.mp4"
-        _write(output, frames, round(1 / dt))
+        _write(output, frames, round(1 / (_EACH * dt)))
         print(f"Video: {output}")
 
 
@@ -81,8 +94,7 @@ def _write(output: Path, frames: "list[np.ndarray]", frames_per_second: int) -> 
 
     try:
         if output.suffix == ".gif":
-            # Viewers of GIFs slow down what is faster than 50 Hz, and every second frame halves the file.
-            imageio.imwrite(output, frames[::2], duration=2000 / frames_per_second, loop=0)
+            imageio.imwrite(output, frames, duration=1000 / frames_per_second, loop=0)
         else:
             imageio.imwrite(output, frames, fps=frames_per_second, macro_block_size=8)
     except OSError as error:
