@@ -87,7 +87,10 @@ def run_training(
         for doubt in agent.env.simulation.spec.doubtful:
             print(doubt)
         for name in config.randomization.without_effect(agent.env.simulation.layout):
-            print(f"randomization.{name} has no effect: it scales what is zero in '{config.env.robot.name}'")
+            robot = config.env.robot.name
+            print(
+                f"randomization.{name} has no effect: it scales what is zero in '{robot}', unless its YAML gives some"
+            )
         evaluation = EvaluationCallback(config)
         trainer = make_trainer(config, run_dir, agent, evaluation, resume)
         trainer.fit(stop)
