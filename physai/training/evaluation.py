@@ -44,6 +44,7 @@ class Evaluation:
         success: Whether the last step of the episode was a success.
         settled: Whether all errors were within their tolerances in the last ``SETTLED`` s of its time, in which the
             robot was watched on after a success.
+        crashed: Whether the episode, or the time after its success, was ended by a failure, such as a collision.
         length: Control steps until the first success of an episode that ended with one, or until its end.
         error: The task's largest error at the end, of those in the unit of its first one.
         episode_return: Sum of rewards.
@@ -54,6 +55,7 @@ class Evaluation:
 
     success: Tensor
     settled: Tensor
+    crashed: Tensor
     length: Tensor
     error: Tensor
     episode_return: Tensor
@@ -92,6 +94,8 @@ class Evaluation:
             "success_ci": list(self.success_ci),
             "settled_rate": self.settled_rate,
             "settled_ci": list(self.settled_ci),
+            "crashed_rate": float(self.crashed.double().mean()),
+            "crashed_ci": list(wilson(self.crashed)),
             "steps_to_goal": float(reached.double().mean()) if len(reached) else None,
             "final_distance": float(self.error.double().mean()),
             "distance_unit": self.unit,
@@ -130,7 +134,7 @@ def _one_round(policy: TensorDictModuleBase, env: TransformedRobotEnv) -> dict[s
     simulation, tensordict = env.simulation, env.reset()
     task, dt, robots = simulation.task, simulation.config.control_dt, simulation.num_envs
     columns = [i for i, tolerance in enumerate(task.tolerances) if tolerance.unit == task.tolerances[0].unit]
-    finished, success, failed = torch.zeros(3, robots, dtype=torch.bool)
+    finished, success, crashed = torch.zeros(3, robots, dtype=torch.bool)
     length, first = torch.zeros(2, robots, dtype=torch.int64)
     error, episode_return = torch.zeros(2, robots)
     changes, accelerations = [], []
@@ -142,7 +146,7 @@ def _one_round(policy: TensorDictModuleBase, env: TransformedRobotEnv) -> dict[s
             accelerations.append(np.abs(simulation.state.joint_velocity - velocity) / dt)
             succeeds, steps = tensordict.get("success")[:, 0], tensordict.get("episode_length")[:, 0]
             first = torch.where(succeeds & (first == 0), steps, first)
-            failed |= tensordict.get("terminated")[:, 0] & ~succeeds
+            crashed |= tensordict.get("terminated")[:, 0] & ~succeeds
             now = tensordict.get("done")[:, 0] & ~finished
             finished |= now
             success[now] = succeeds[now]
@@ -152,7 +156,8 @@ def _one_round(policy: TensorDictModuleBase, env: TransformedRobotEnv) -> dict[s
     stayed = simulation.within >= min(math.ceil(SETTLED / dt - 1e-9), task.max_steps)
     return {
         "success": success,
-        "settled": torch.from_numpy(stayed) & ~failed,
+        "settled": torch.from_numpy(stayed) & ~crashed,
+        "crashed": crashed,
         "length": length,
         "error": error,
         "episode_return": episode_return,

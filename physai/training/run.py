@@ -273,6 +273,7 @@ def print_summary(summary: dict[str, Any], title: str) -> None:
         joint, share = max(summary["in_a_row_near_limit"].items(), key=lambda item: item[1])
         rows["near a limit"] = f"{share:.1%} of that time" + (f", {joint}" if share else "")
     rows |= {
+        "crashed": rate(summary, "crashed"),
         "steps to goal": "none reached" if steps is None else f"{steps:.1f}",
         "final distance": f"{summary['final_distance']:.3f} {summary['distance_unit']}",
         "return": f"{summary['return']:.2f}",

@@ -75,7 +75,7 @@ def test_a_run_that_requires_transfer_gets_no_file_where_arms_differ(required, m
 
 def evaluation(rate, episodes=1000):
     success, zeros = torch.arange(episodes) < rate * episodes, torch.zeros(episodes)
-    return Evaluation(success, success, zeros, zeros, zeros, zeros, zeros, "m")
+    return Evaluation(success, success, ~success, zeros, zeros, zeros, zeros, zeros, "m")
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,7 @@ import copy
 import pytest
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase
+from tensordict.nn import TensorDictModule, TensorDictModuleBase
 
 from physai.envs.make import make
 from physai.training.agent import Agent, make_evaluation_env
@@ -24,7 +24,7 @@ def trained():
 
 def result(successes: int, episodes: int) -> Evaluation:
     success, zeros = torch.arange(episodes) < successes, torch.zeros(episodes)
-    return Evaluation(success, success, torch.full((episodes,), 10), zeros, zeros, zeros, zeros, "m")
+    return Evaluation(success, success, ~success, torch.full((episodes,), 10), zeros, zeros, zeros, zeros, "m")
 
 
 def test_the_interval_is_wilsons():
@@ -36,7 +36,7 @@ def test_the_interval_is_wilsons():
 
 def test_steps_to_goal_count_only_goals_that_were_reached():
     reached = torch.tensor([True, False, True])
-    evaluation = Evaluation(reached, reached, torch.tensor([10, 200, 30]), *torch.zeros(4, 3), "m")
+    evaluation = Evaluation(reached, reached, ~reached, torch.tensor([10, 200, 30]), *torch.zeros(4, 3), "m")
     assert evaluation.summary()["steps_to_goal"] == 20
     assert result(0, 3).summary()["steps_to_goal"] is None
 
@@ -129,6 +129,15 @@ def test_jerky_commands_show_in_the_change_of_action_and_in_the_acceleration(swu
     for figure in ("action_change_p99", "acceleration_p99"):
         assert jerky[figure] > 5 * smooth[figure]
     assert jerky["action_change_p99"] == pytest.approx(2.0)  # from one end to the other
+
+
+def test_who_bends_into_itself_has_crashed_and_has_neither_success_nor_settled():
+    env = make("panda_reach", 32, overrides=["physics=mujoco", "randomization=none"])
+    bend = TensorDictModule(lambda features: torch.ones(len(features), 7), ["features"], ["action"])
+    bent = evaluate(bend, env, 32, seed=3)
+    env.close()
+    assert 0.1 < bent.summary()["crashed_rate"] <= 1.0
+    assert not (bent.crashed & (bent.success | bent.settled)).any()
 
 
 @pytest.mark.slow
