@@ -12,6 +12,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from physai.artifact.module import DeployablePolicy
 from physai.deploy.metadata import LAST_COMMAND, MEMORY
 from physai.envs.make import TransformedRobotEnv
+from physai.signals import Quantity
 
 ON_POLICY = 1024
 _STEPS = 64
@@ -54,6 +55,8 @@ def extreme_states(policy: DeployablePolicy, env: TransformedRobotEnv) -> States
     speeds = [-_FAST * speed, -speed, torch.zeros_like(speed), speed, _FAST * speed]
     drawn = torch.from_numpy(region.sample(4, torch.Generator().manual_seed(0)))
     goals = torch.cat([torch.zeros_like(drawn[:1]), drawn, _FAR * drawn])
+    if env.simulation.task.goal.quantity is Quantity.POSE:
+        goals[:, 3:] = torch.cat([drawn[:1], drawn, drawn])[:, 3:]  # the controller lets rotations pass only
     # Corners of all joints would be too many for long arms: all at one end, and one by one.
     poses = torch.cat([torch.stack([low, torch.zeros_like(low), high]), low.diag(), high.diag()])
     rows = list(itertools.product(poses, speeds, goals))
