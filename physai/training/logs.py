@@ -54,6 +54,7 @@ EPISODE_COLUMNS = ("frame", "return", "length", "success")
 EVALUATION_COLUMNS = (
     "evaluation/success_rate",
     "evaluation/settled_rate",
+    "evaluation/crashed_rate",
     "evaluation/steps_to_goal",
     "evaluation/final_distance",
     "evaluation/return",
