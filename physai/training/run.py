@@ -267,13 +267,13 @@ def _mean_and_p99(summary: dict[str, Any], name: str) -> str:
 def print_summary(summary: dict[str, Any], title: str) -> None:
     """Show the figures that matter as a table."""
     steps = summary["steps_to_goal"]
-    rows = {"success rate": rate(summary, "success"), "settled": rate(summary, "settled")}
+    names = {"success rate": "success", "settled": "settled", "crashed": "crashed"}
+    rows = {shown: rate(summary, name) for shown, name in names.items()}
     if "in_a_row" in summary:
         rows[f"{summary['in_a_row']} in a row"] = rate(summary, "in_a_row")
         joint, share = max(summary["in_a_row_near_limit"].items(), key=lambda item: item[1])
         rows["near a limit"] = f"{share:.1%} of that time" + (f", {joint}" if share else "")
     rows |= {
-        "crashed": rate(summary, "crashed"),
         "steps to goal": "none reached" if steps is None else f"{steps:.1f}",
         "final distance": f"{summary['final_distance']:.3f} {summary['distance_unit']}",
         "return": f"{summary['return']:.2f}",
