@@ -17,9 +17,7 @@ if TYPE_CHECKING:
     import numpy as np
 
 _PAUSE = 15  # control steps to look at the arm at its goal
-_EACH = (
-    2  # control steps a frame of a video: 25 Hz show as much as 50, and a frame of meshes takes a quarter of a second
-)
+_EACH = 2  # control steps for each frame of a video: 25 Hz show as much as 50, and meshes take 0.2 s a frame
 
 
 class PlayConfig(PolicyChoice):
