@@ -71,8 +71,8 @@ class Reaching(Task):
                 )
             self.surroundings = spec.collision.within(floor, boxes)
             apart = self.surroundings.distance(spec.home[np.newaxis])[0]
-            nearest = apart.argmin()
-            if apart[nearest] <= 0:
+            if apart.min(initial=np.inf) <= 0:
+                nearest = apart.argmin()
                 first, second = self.surroundings.names[nearest]
                 raise UserError(
                     f"env.robot.home: '{first}' and '{second}' overlap there by {-1e3 * apart[nearest]:.1f} mm: each "
