@@ -39,6 +39,7 @@ class CollisionGuard:
         self._time, self._slow = config.stopping_time, _SLOW * config.max_velocity
         self.model = self._around(metadata.collision, config)
         self._margin = np.empty(0) if self.model is None else self._margins(self.model, metadata.home, config)
+        self._steps = _STEP * np.eye(len(metadata.home))
 
     def apply(
         self, velocity: np.ndarray, position: np.ndarray, limited: Limited
@@ -50,38 +51,41 @@ class CollisionGuard:
             position: Where the joints are, rad.
             limited: Brings other velocities within the limits that hold now.
         """
-        if (nearing := self.held_back(position, velocity)) is None:
+        if self.model is None:
             return velocity, None
-        past = self._past(position, velocity)
+        # All at once: slopes are seldom needed, but hardly cost more in the same call.
+        ways = np.vstack([np.zeros_like(position), velocity * self._time, self._steps])
+        now, after, *stepped = self.model.distance(position + ways)
+        if (nearing := self._nearing(now, after)) is None:
+            return velocity, None
+        past = self._past(velocity, now, (np.array(stepped) - now).T / _STEP)
         if past @ velocity < _LITTLE * (velocity @ velocity):
             return None, nearing
         past, _ = limited(past * min(1.0, self._slow / np.abs(past).max()))
-        return (past if self.held_back(position, past) is None else None), nearing
+        after = self.model.distance((position + past * self._time)[np.newaxis])[0]
+        return (past if self._nearing(now, after) is None else None), nearing
 
-    def held_back(self, position: np.ndarray, velocity: np.ndarray) -> str | None:
-        """Return what would come too close if the arm went on with velocities [n], rad/s, from positions [n], rad.
-
-        What is too close already may go apart.
-        """
-        if self.model is None:
-            return None
-        before, after = self.model.distance(np.stack([position, position + velocity * self._time]))
-        nearing = np.where((after < self._margin) & (after < before - _ROUNDING), after, np.inf)
-        worst = int(nearing.argmin())
-        if nearing[worst] == np.inf:
+    def _nearing(self, now: np.ndarray, after: np.ndarray) -> str | None:
+        """Name what comes too close between two times, of their P distances, m. What is so already may go apart."""
+        assert self.model is not None
+        too_close = np.where((after < self._margin) & (after < now - _ROUNDING), after, np.inf)
+        worst = int(too_close.argmin())
+        if too_close[worst] == np.inf:
             return None
         first, second = self.model.names[worst]
         return f"'{first}' would come within {max(after[worst], 0.0):.3f} m of '{second}'"
 
-    def _past(self, position: np.ndarray, velocity: np.ndarray) -> np.ndarray:
+    def _past(self, velocity: np.ndarray, distance: np.ndarray, slope: np.ndarray) -> np.ndarray:
         """Return the velocities nearest to these that bring nothing too close, as far as distances change evenly.
 
         What is not kept is met one after the other, the worst one first (Kaczmarz, 1937).
+
+        Args:
+            velocity: What is wanted, rad/s, [n].
+            distance: m, [P].
+            slope: By how much it changes, m/rad, [P, n].
         """
-        assert self.model is not None
-        distance = self.model.distance(np.vstack([position, position + _STEP * np.eye(len(position))]))
-        slope = (distance[1:] - distance[0]).T / _STEP  # m/rad, [P, n]
-        least = np.minimum((self._margin + _SPARE - distance[0]) / self._time, _APART)  # to go apart by, m/s, [P]
+        least = np.minimum((self._margin + _SPARE - distance) / self._time, _APART)  # to go apart by, m/s, [P]
         for _ in range(_PROJECTIONS):
             short = least - slope @ velocity
             worst = int(short.argmax())

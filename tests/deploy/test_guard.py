@@ -151,7 +151,7 @@ def test_neighbours_that_are_always_close_may_come_closer_than_the_margin(polici
     at_home = panda.collision.distance(panda.home[None])[0]
     assert {names[row] for row in np.flatnonzero(at_home < 0.02)} == {("panda_link5", "panda_link7")}
     position, fold = panda.home.copy(), np.eye(7)[5] * -0.01  # joint 6
-    while guard.held_back(position, fold) is None:
+    while guard.apply(fold, position, lambda velocity: (velocity, None))[1] is None:
         position += fold
     assert 0.0 < panda.collision.distance(position[None]).min() < 0.01
     assert position[5] < panda.home[5] - 0.3

@@ -10,6 +10,9 @@ import pytest
 
 from tests.ros.peer import Peer, Process, wait_for
 
+# An arm that is driven may not be late, as it is where other tests start their processes on the same two cores.
+drives = pytest.mark.realtime
+
 
 def demo(*overrides: str) -> list[str]:
     return [sys.executable, "-m", "physai.ros.demo", *overrides]
@@ -25,6 +28,7 @@ def alive(pid: int) -> bool:
 
 
 @pytest.mark.slow
+@drives
 def test_goals_are_reached_and_held_for_three_seconds_and_the_path_is_drawn(start, policy_path, tmp_path):
     picture = tmp_path / "path.png"
     process = start.run(demo(f"policy_path={policy_path}", f"output={picture}", "goals=3"))
@@ -36,6 +40,7 @@ def test_goals_are_reached_and_held_for_three_seconds_and_the_path_is_drawn(star
 
 
 @pytest.mark.slow
+@drives
 def test_a_policy_that_commands_positions_drives_an_arm_that_takes_them(start, position_run, tmp_path):
     picture = tmp_path / "path.png"
     overrides = (f"policy_path={position_run / 'policy.pt'}", f"output={picture}", "goals=2", "hold=1")
@@ -46,6 +51,7 @@ def test_a_policy_that_commands_positions_drives_an_arm_that_takes_them(start, p
 
 
 @pytest.mark.slow
+@drives
 def test_an_arm_with_seven_joints_is_driven_to_points_in_space(start, panda_run, tmp_path):
     picture = tmp_path / "path.png"
     overrides = (f"policy_path={panda_run / 'policy.pt'}", f"output={picture}", "goals=3", "hold=1")
@@ -66,6 +72,7 @@ def test_it_refuses_to_start_where_a_robot_is_already(start, policy_path):
 
 
 @pytest.mark.slow
+@drives
 def test_it_ends_with_the_reason_where_the_arm_is_stopped_for_good(start, domain, policy_path, tmp_path):
     process = start.run(demo(f"policy_path={policy_path}", f"output={tmp_path / 'path.png'}"))
     process.says("sending goals", 60)
