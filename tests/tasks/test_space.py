@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 from physai.envs.simulation import Simulation
 from physai.errors import UserError
 from physai.physics import RobotState
+from physai.robots import quaternion_matrix
 from physai.signals import Quantity
 from physai.tasks import Step
 
@@ -107,6 +108,26 @@ def test_what_is_said_to_shorten_the_errors_does(simulate, name):
         step = joints.double().numpy()
         step *= 1e-3 / np.linalg.norm(step, axis=1, keepdims=True)
         assert (task.error(state_at(q + step), goal)[:, column] < before[:, column]).mean() > 0.95
+
+
+@torch.no_grad()
+def test_the_suggested_way_leads_from_goal_to_goal_and_seldom_touches_anything(simulate):
+    simulation = simulate("panda_pose")
+    task, limit = simulation.task, torch.from_numpy(simulation.spec.command_limit)
+    goals = torch.from_numpy(task.sample_goal(401, generator())).float()
+    configurations = task.module.inverse(goals[:, :3], quaternion_matrix(goals[:, 3:])).double()
+    q, there = configurations[:-1], configurations[1:]
+    straight = torch.stack([q + share * (there - q) for share in torch.linspace(0, 1, 50)])
+    touched = np.zeros(400, bool)
+    for _ in range(300):
+        _, features = task.module(q.float(), torch.zeros(400, 7), goals[1:])
+        q = q + 0.02 * limit * torch.tanh(features[:, -7:].double())
+        touched |= task.clearance(q.numpy()) <= 0
+    assert (task.error(state_at(q.numpy()), goals[1:].numpy()) < simulation.tolerance).all(axis=1).mean() > 0.98
+    touched_straight = task.clearance(straight.flatten(0, 1).numpy()).reshape(50, 400).min(axis=0) <= 0
+    clear = task.clearance(configurations.numpy()) > 0
+    on_the_way = clear[:-1] & clear[1:]
+    assert 2 * (touched & on_the_way).sum() <= (touched_straight & on_the_way).sum()
 
 
 @pytest.mark.parametrize("name", SPACE)
