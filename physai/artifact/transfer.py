@@ -18,9 +18,9 @@ from physai.training.run import TrainedPolicy
 
 LOWEST = 0.97  # success rate in the other engine that a policy must have for certain (lower bound of 95 %)
 LARGEST_DROP = 0.01  # of the success rate, from the engine of the training to the other
-_SPEED, _STEPS = 0.5, 25  # of the largest command, and for how long each joint is moved
+_SPEED, _STEPS, _SOON = 0.5, 25, 8  # of the largest command; for how many steps each joint is moved, and with little effort
 _LATE = 2  # control steps; a drive's time constant takes one
-_SCALES = 0.5 ** np.arange(16)  # of the effort limit
+_SCALES = 0.5 ** np.arange(24)  # of the effort limit
 
 
 def other_engine(physics: dict[str, Any]) -> dict[str, Any]:
@@ -107,7 +107,8 @@ def differences(config: EnvConfig, other: dict[str, Any]) -> list[str]:
 
     What is looked for: joints that turn the other way or in another order, commands that arrive later, motors with
     less or more effort than the same limit allows. How fast a drive closes in on its command is no difference, nor is
-    the inertia of its rotor, which is left out here: a motor that has more to turn seems weaker.
+    the inertia of its rotor, which is left out here: a motor that has more to turn seems weaker. So are gravity, under
+    which an arm with little effort sinks, and friction, which leaves next to nothing of it.
 
     Args:
         config: Robot and engine of the training.
@@ -119,8 +120,9 @@ def differences(config: EnvConfig, other: dict[str, Any]) -> list[str]:
     engines = (
         {key: 0.0 if key == "armature" else value for key, value in one.items()} for one in (config.physics, other)
     )
+    floating = config.robot.model_copy(update={"gravity": [0.0, 0.0, 0.0]})
     (own, own_onset, own_weak), (moved, onset, weak) = (
-        _respond(config.model_copy(update={"physics": engine})) for engine in engines
+        _respond(config.model_copy(update={"physics": engine, "robot": floating})) for engine in engines
     )
     joints, lines = config.robot.joints, []
     moves = np.abs(moved).argmax(axis=1)
@@ -134,9 +136,9 @@ def differences(config: EnvConfig, other: dict[str, Any]) -> list[str]:
     late = int(np.median(onset - own_onset))
     if abs(late) >= _LATE:
         lines.append(f"commands arrive {abs(late)} control steps {'later' if late > 0 else 'earlier'}")
-    full = np.abs(own.diagonal())
     for number, joint in enumerate(joints):
-        scale = int(np.abs(own_weak[:, number] / full[number] - 0.5).argmin())  # where the limit is what decides
+        far = own_weak[:, number] / own_weak[0, number]
+        scale = int((far <= 0.5).argmax())  # the largest at which the limit decides all the way
         share = float(weak[scale, number] / own_weak[scale, number])
         if not 0.7 < share < 1.4:
             less = "less" if share < 1 else "more"
@@ -147,33 +149,33 @@ def differences(config: EnvConfig, other: dict[str, Any]) -> list[str]:
 
 
 def _respond(config: EnvConfig) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Tell each of n joints to move, alone, and see what they do, relative to what they do when none is told to.
+    """Tell each of n joints to move, alone, and see what they do.
 
-    Rows of the simulation: each joint in turn at each scale of its effort limit; once told to move, once not.
+    Rows of the simulation: each joint in turn at each scale of its effort limit.
 
     Returns:
         How far they moved, rad, at the end, [joint told, joint moving]; control steps until the joint that moves most
-        does so, [n]; and how far the told joint gets with its effort limit scaled, rad, [scales, n].
+        does so, [n]; and how far the told joint gets soon with its effort limit scaled, rad, [scales, n].
     """
     joints = len(config.robot.joints)
     rows = joints * len(_SCALES)
     at_home = config.start.model_copy(update={"spread": [0.0] * joints, "carried_over": 0.0})
-    simulation = Simulation(config.model_copy(update={"start": at_home}), 2 * rows, seed=0)
+    simulation = Simulation(config.model_copy(update={"start": at_home}), rows, seed=0)
     with closing(simulation):
-        told = np.tile(np.repeat(np.arange(joints), len(_SCALES)), 2)
-        parameters = simulation.physics_parameters.copy()
-        effort = simulation.layout.columns["effort_limit"].start + told
-        parameters[np.arange(2 * rows), effort] *= np.tile(_SCALES, 2 * joints)
+        told, every = np.repeat(np.arange(joints), len(_SCALES)), np.arange(rows)
+        parameters, columns = simulation.physics_parameters.copy(), simulation.layout.columns
+        parameters[:, columns["joint_friction"]] = 0.0
+        parameters[every, columns["effort_limit"].start + told] *= np.tile(_SCALES, joints)
         simulation.reset(parameters=parameters)
-        action = np.zeros((2 * rows, joints), np.float32)
-        action[np.arange(rows), told[:rows]] = _SPEED
+        action = np.zeros((rows, joints), np.float32)
+        action[every, told] = _SPEED
         path = []
         for _ in range(_STEPS):
             simulation.step(action)
-            path.append(simulation.state.joint_position[:rows] - simulation.state.joint_position[rows:])
+            path.append(simulation.state.joint_position - simulation.spec.home)
     path_of = np.stack(path).reshape(_STEPS, joints, len(_SCALES), joints)  # [step, told, scale, moving]
     strong, of_told = path_of[:, :, 0], path_of[:, np.arange(joints), :, np.arange(joints)]  # [told, step, scale]
     most = np.abs(strong[-1]).argmax(axis=1)
     alone = np.abs(strong[:, np.arange(joints), most])  # [step, told]
     step = _SPEED * simulation.spec.command_limit * config.control_dt
-    return strong[-1], (alone > 0.2 * step).argmax(axis=0), np.abs(of_told[:, -1]).T
+    return strong[-1], (alone > 0.2 * step).argmax(axis=0), np.abs(of_told[:, _SOON - 1]).T

@@ -219,7 +219,7 @@ def _make_model(spec: RobotSpec, motor: str, armature: float, time_step: float) 
         model = made.compile()
     except ValueError as error:
         raise UserError(f"{spec.urdf}: MuJoCo cannot load it: {' '.join(str(error).split())}") from error
-    model.opt.timestep = time_step
+    model.opt.timestep, model.opt.gravity = time_step, spec.gravity
     model.opt.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     off = mujoco.mjtDisableBit
     # A warm start would be part of the state; friction and limits are in the impulses.

@@ -209,7 +209,7 @@ def _make_world(spec: RobotSpec, model: Path, robots: int, time_step: float) -> 
     if client < 0:
         raise UserError("PyBullet has no room for another world in this process (it holds 1,024)")
     bullet.setTimeStep(time_step, client)
-    bullet.setGravity(0, 0, -9.81, client)
+    bullet.setGravity(*spec.gravity, client)
     # By default PyBullet ends after 50 sweeps over the motors, or when their impulses hardly change. An arm of seven
     # joints then goes up to 0.07 rad astray in 4 s; going on until they agree costs a fifth of its steps, and 3 percent
     # of a two-link arm's. Each robot is solved by itself, as long as it needs.

@@ -23,7 +23,7 @@ class RobotConfig(Config):
     ``command`` says what drives the joints, ``command_limit`` how fast an action of 1 moves each of them, rad/s, and
     ``position_gain`` how fast a joint that takes positions closes in on them, 1/s. What follows stands in the place of
     what the URDF says, or does not say: ``damping``, N·m·s/rad, and ``friction``, N·m, one value a joint, and
-    ``inertials`` of links by name. Without ``collision`` nobody asks whether the robot touches itself.
+    ``inertials`` of links by name. ``gravity`` is in the base's frame, m/s²: it says how the base is mounted. Without ``collision`` nobody asks whether the robot touches itself.
     """
 
     name: str
@@ -36,6 +36,7 @@ class RobotConfig(Config):
     position_gain: PositiveFloat
     damping: list[NonNegativeFloat] | None
     friction: list[NonNegativeFloat] | None
+    gravity: list[float] = Field(min_length=3, max_length=3)
     inertials: dict[str, InertialConfig]
     collision: CollisionConfig | None
 
@@ -59,6 +60,7 @@ class RobotSpec:
         position_gain: Of joints that take positions, 1/s: they want to move at this times the distance to go.
         damping: N·m·s/rad, [n].
         friction: Coulomb friction, N·m, [n].
+        gravity: In the base's frame, m/s², [3].
         chain: Joints from the base to the end effector, in order.
         bodies: What engines simulate, from the base on.
         moving_links: Bodies with mass that the controlled joints move, by the name of their first link.
@@ -81,6 +83,7 @@ class RobotSpec:
     position_gain: float
     damping: np.ndarray
     friction: np.ndarray
+    gravity: np.ndarray
     chain: tuple[Joint, ...]
     bodies: tuple[Body, ...]
     moving_links: tuple[str, ...]
@@ -184,6 +187,7 @@ class RobotSpec:
             position_gain=config.position_gain,
             damping=_dynamics(joints, "damping", config.damping),
             friction=_dynamics(joints, "friction", config.friction),
+            gravity=np.array(config.gravity, dtype=np.float64),
             chain=tuple(chain),
             bodies=together,
             moving_links=tuple(body.name for body in moving),

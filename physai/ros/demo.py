@@ -67,7 +67,7 @@ def robot_overrides(metadata: Metadata) -> list[str]:
     files = [path.stem for path in (conf_dir() / "robot").glob("*.yaml")]
     if metadata.robot not in files:
         raise UserError(f"the policy is for '{metadata.robot}', and conf/robot has only {', '.join(sorted(files))}")
-    changed = ("joints", "end_effector", "home", "command", "command_limit", "position_gain")
+    changed = ("joints", "end_effector", "home", "command", "command_limit", "position_gain", "gravity")
     return [
         f"robot@env.robot={metadata.robot}",
         *(f"env.robot.{key}={json.dumps(robot[key])}" for key in changed),

@@ -17,6 +17,9 @@ ENVS = {
     "planar arm": ("reacher",),
     "planar arm by positions": ("reacher", "env.robot.command=joint_position"),
     "KUKA": ("kuka_reacher",),
+    "Panda": ("panda_reach",),
+    "KUKA with seven joints": ("kuka7_reach",),
+    "xArm": ("xarm_reach",),
 }
 
 
@@ -44,12 +47,12 @@ def test_the_engines_move_each_joint_alike(env_config, env, engine):
         ("Weak", "the motor of {last} has less effort: with the same limit it gets 0."),
     ],
 )
-@pytest.mark.parametrize("env", ["planar arm", "KUKA"])
+@pytest.mark.parametrize("env", ["planar arm", "KUKA", "Panda"])
 def test_what_is_planted_in_the_other_engine_is_named(env_config, env, name, said):
     config = env_config(*ENVS[env])
-    first, second = config.robot.joints
+    first, second, *_ = config.robot.joints
     found = transfer.differences(config, planted(name))
-    wanted = said.format(first=first, second=second, last=second)
+    wanted = said.format(first=first, second=second, last=config.robot.joints[-1])
     assert any(line.startswith(wanted) for line in found), found
 
 

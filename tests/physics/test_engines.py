@@ -2,8 +2,10 @@
 
 import numpy as np
 import pytest
+import torch
 
-from physai.physics import nominal_dynamics
+from physai.physics import RobotState, nominal_dynamics
+from physai.robots import ForwardKinematics, RobotSpec
 from tests.physics.moving import commands, dynamics, joints, one_of, reset_all, run, start, weak, wild
 
 
@@ -141,3 +143,18 @@ def test_commands_of_another_shape_are_refused(planar, make, shape):
     physics = make(planar, 4)
     with pytest.raises(ValueError, match="shape"):
         physics.step(np.zeros(shape))
+
+
+def test_an_arm_without_effort_falls_the_other_way_where_it_hangs_from_a_ceiling(env_config, make):
+    config = env_config("panda_reach").robot
+    moved = []
+    for down in (-9.81, 0.0, 9.81):
+        spec = RobotSpec.from_config(config.model_copy(update={"gravity": [0.0, 0.0, down]}))
+        physics, none = make(spec, 1), np.zeros((1, 7))
+        reset_all(physics, RobotState(spec.home[None], none), nominal_dynamics(spec) | {"effort_limit": none + 1e-3})
+        moved.append(run(physics, np.zeros((3, 1, 7)))[-1, 0, 0] - spec.home)
+    stands, floats, hangs = np.array(moved)
+    height = ForwardKinematics(spec)(torch.from_numpy(spec.home + np.array([stands, hangs])).float())[:, 2]
+    assert height[0] < height[1] - 0.005  # m
+    np.testing.assert_allclose(floats, 0.0, atol=1e-6)
+    np.testing.assert_allclose(hangs, -stands, atol=0.05 * np.abs(stands).max())

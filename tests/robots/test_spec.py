@@ -64,9 +64,10 @@ def test_a_command_limit_is_needed_for_each_joint(values):
         ("env.robot.command_limit=[0.0,1.0]", ["command_limit.0", "greater than 0"]),
         ("env.robot.command_limit=2.0", ["command_limit", "list"]),
         ("env.robot.position_gain=-1.0", ["position_gain", "greater than 0"]),
+        ("env.robot.gravity=[0.0,-9.81]", ["gravity", "at least 3 items"]),
     ],
 )
-def test_an_impossible_command_is_refused_in_one_line(override, words):
+def test_an_impossible_value_is_refused_in_one_line(override, words):
     with pytest.raises(UserError) as caught:
         RobotSpec.from_config(validate(EnvConfig, compose("train", [override]).env).robot)
     assert len(str(caught.value).splitlines()) == 1
