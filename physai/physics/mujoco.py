@@ -8,7 +8,7 @@ import numpy as np
 from physai.config import Count, NonNegativeFloat, PositiveFloat
 from physai.errors import UserError
 from physai.physics.impulse import FASTEST, limit_velocity, motor_velocity
-from physai.physics.interface import DynamicsParameters, RobotState, loaded_links, loaded_mass, nominal_dynamics
+from physai.physics.interface import AT_REST, DynamicsParameters, RobotState, loaded_links, loaded_mass, nominal_dynamics
 from physai.robots import RobotSpec, engine_urdf
 from physai.signals import Quantity
 
@@ -168,7 +168,7 @@ class _Impulse:
     def step(self, command: np.ndarray) -> None:
         dt = self._batch.model.opt.timestep
         position, velocity = self._position.copy(), self._velocity.copy()
-        effort = np.where((command - velocity) * velocity < 0.0, self._braking, self._speeding)
+        effort = np.where((command - velocity) * velocity < -AT_REST, self._braking, self._speeding)
         for _ in range(self._substeps):
             self._batch.forward()
             free = np.clip(velocity + dt * self._acceleration, -FASTEST, FASTEST)

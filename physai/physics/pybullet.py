@@ -10,7 +10,7 @@ import numpy as np
 import pybullet as bullet
 
 from physai.errors import UserError
-from physai.physics.interface import DynamicsParameters, RobotState, loaded_links, loaded_mass, nominal_dynamics
+from physai.physics.interface import AT_REST, DynamicsParameters, RobotState, loaded_links, loaded_mass, nominal_dynamics
 from physai.robots import RobotSpec, engine_urdf
 from physai.signals import Quantity
 
@@ -149,7 +149,7 @@ class PyBulletPhysics:
             client = world.client
             motors = islice(commands, len(world.bodies) * len(joints))
             for (body, joint, speeding, braking, gain), target, velocity in motors:
-                effort = braking if (target - velocity) * velocity < 0.0 else speeding
+                effort = braking if (target - velocity) * velocity < -AT_REST else speeding
                 command(body, joint, mode, 0.0, target, effort, 0.1, gain, 0.0, client)
             for _ in range(self.substeps):
                 step(client)
