@@ -18,7 +18,8 @@ from physai.training.run import TrainedPolicy
 
 LOWEST = 0.97  # success rate in the other engine that a policy must have for certain (lower bound of 95 %)
 LARGEST_DROP = 0.01  # of the success rate, from the engine of the training to the other
-_SPEED, _STEPS, _SOON = 0.5, 25, 8  # of the largest command; for how many steps each joint is moved, and with little effort
+_SPEED, _STEPS = 0.5, 25  # of the largest command, and for how long each joint is moved
+_SOON = 8  # control steps, after which it shows what little effort does
 _LATE = 2  # control steps; a drive's time constant takes one
 _SCALES = 0.5 ** np.arange(24)  # of the effort limit
 

@@ -8,7 +8,14 @@ import numpy as np
 from physai.config import Count, NonNegativeFloat, PositiveFloat
 from physai.errors import UserError
 from physai.physics.impulse import FASTEST, limit_velocity, motor_velocity
-from physai.physics.interface import AT_REST, DynamicsParameters, RobotState, loaded_links, loaded_mass, nominal_dynamics
+from physai.physics.interface import (
+    AT_REST,
+    DynamicsParameters,
+    RobotState,
+    loaded_links,
+    loaded_mass,
+    nominal_dynamics,
+)
 from physai.robots import RobotSpec, engine_urdf
 from physai.signals import Quantity
 

@@ -10,7 +10,14 @@ import numpy as np
 import pybullet as bullet
 
 from physai.errors import UserError
-from physai.physics.interface import AT_REST, DynamicsParameters, RobotState, loaded_links, loaded_mass, nominal_dynamics
+from physai.physics.interface import (
+    AT_REST,
+    DynamicsParameters,
+    RobotState,
+    loaded_links,
+    loaded_mass,
+    nominal_dynamics,
+)
 from physai.robots import RobotSpec, engine_urdf
 from physai.signals import Quantity
 

@@ -23,7 +23,8 @@ class RobotConfig(Config):
     ``command`` says what drives the joints, ``command_limit`` how fast an action of 1 moves each of them, rad/s, and
     ``position_gain`` how fast a joint that takes positions closes in on them, 1/s. What follows stands in the place of
     what the URDF says, or does not say: ``damping``, N·m·s/rad, and ``friction``, N·m, one value a joint, and
-    ``inertials`` of links by name. ``gravity`` is in the base's frame, m/s²: it says how the base is mounted. Without ``collision`` nobody asks whether the robot touches itself.
+    ``inertials`` of links by name. ``gravity`` is in the base's frame, m/s²: it says how the base is mounted. Without
+    ``collision`` nobody asks whether the robot touches itself.
     """
 
     name: str
