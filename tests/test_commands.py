@@ -352,7 +352,9 @@ def test_plot_overlays_runs(run, copied, tmp_path):
     assert (tmp_path / "both.png").read_bytes().startswith(b"\x89PNG")
 
 
-@pytest.mark.parametrize("module", ["train", "search", "evaluate", "export", "play", "plot", "stress", "capsules"])
+@pytest.mark.parametrize(
+    "module", ["train", "search", "evaluate", "export", "play", "plot", "stress", "identify", "capsules"]
+)
 def test_help_shows_examples_and_every_value(run, module):
     code, output, _ = run(module, "--help")
     assert code == 0

@@ -18,6 +18,7 @@ from physai.config import validate
 from physai.envs.simulation import EnvConfig
 from physai.evaluate import EvaluateConfig
 from physai.export import ExportConfig
+from physai.identify.__main__ import IdentifyConfig
 from physai.play import PlayConfig
 from physai.plot import PlotConfig
 from physai.ros.demo import DemoConfig
@@ -35,6 +36,7 @@ COMMANDS = {
     "physai.train": ("train", TrainConfig),
     "physai.search": ("search", SearchConfig),
     "physai.stress": ("stress", StressConfig),
+    "physai.identify": ("identify", IdentifyConfig),
     "physai.evaluate": ("evaluate", EvaluateConfig),
     "physai.export": ("export", ExportConfig),
     "physai.play": ("play", PlayConfig),

@@ -1,0 +1,158 @@
+"""What a robot was told and what its sensors said, read from a table or a recording of ROS topics."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from physai.config import nearest
+from physai.errors import UserError
+
+_BACKWARDS = 1e-4  # s; a clock that goes back by more has been set
+_WHAT = ("position", "velocity", "command")
+
+
+@dataclass(frozen=True)
+class Recording:
+    """What happened in each of T control steps; NaN where nothing arrived.
+
+    Attributes:
+        control_dt: From step to step, s.
+        position: What the encoders said at the beginning of each step, rad, [T, n].
+        velocity: rad/s, [T, n].
+        command: In force from each step to the next, rad/s or rad, [T, n].
+    """
+
+    control_dt: float
+    position: np.ndarray
+    velocity: np.ndarray
+    command: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.command)
+
+
+def read(path: Path, joints: Sequence[str], control_dt: float, command_topic: str) -> Recording:
+    """Read a CSV file with a header, or the folder of a recording (rosbag2).
+
+    A table has the columns ``time``, s, and for each joint ``position[<joint>]``, ``velocity[<joint>]`` and
+    ``command[<joint>]``; a row's command is in force from its time on.
+
+    Args:
+        path: File or folder.
+        joints: The robot's, in their order.
+        control_dt: Control period, s.
+        command_topic: Where the recording has the commands.
+
+    Raises:
+        UserError: If it cannot be read, or does not hold what is needed; one line says what.
+    """
+    if path.is_dir():
+        states, commands = _of_topics(path, joints, command_topic)
+    else:
+        states, commands = _of_table(path, joints)
+    for what, series in (("joint states", states), ("commands", commands)):
+        _check(path, what, series)
+    return _on_grid(path, states, commands, len(joints), control_dt)
+
+
+def _of_table(path: Path, joints: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
+    """Return states [K, 1 + 2n] and commands [K, 1 + n], times first."""
+    try:
+        table = pd.read_csv(path, skipinitialspace=True)
+    except (OSError, UnicodeDecodeError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or " ".join(str(error).split())
+        raise UserError(f"{path}: {reason}") from error
+    columns = {what: [f"{what}[{joint}]" for joint in joints] for what in _WHAT}
+    for name in ("time", *(column for of in columns.values() for column in of)):
+        if name not in table:
+            raise UserError(f"{path}: it has no column '{name}'{nearest(name, map(str, table.columns))}")
+        if len(table) and not pd.api.types.is_numeric_dtype(table[name]):
+            raise UserError(f"{path}: column '{name}' holds something that is no number")
+    states = table[["time", *columns["position"], *columns["velocity"]]].to_numpy(np.float64)
+    return states, table[["time", *columns["command"]]].to_numpy(np.float64)
+
+
+def _of_topics(folder: Path, joints: Sequence[str], command_topic: str) -> tuple[np.ndarray, np.ndarray]:
+    """Return states [K, 1 + 2n] and commands [M, 1 + n] as they came, times first."""
+    try:
+        from rosbags.highlevel import AnyReader, AnyReaderError
+        from rosbags.typesys import Stores, get_typestore
+    except ImportError as error:
+        raise UserError("recordings need rosbags: pip install rosbags") from error
+    states: list[list[float]] = []
+    commands: list[list[float]] = []
+    try:
+        with AnyReader([folder], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as reader:
+            wanted = [each for each in reader.connections if each.topic in ("/joint_states", command_topic)]
+            for topic in ("/joint_states", command_topic):
+                if topic not in (each.topic for each in wanted):
+                    raise UserError(f"{folder}: it holds no {topic}")
+            for connection, stamp, data in reader.messages(wanted):
+                message: Any = reader.deserialize(data, connection.msgtype)
+                if connection.topic == command_topic:
+                    commands.append([stamp * 1e-9, *message.data])
+                elif (row := _state(folder, message, joints)) is not None:
+                    states.append([stamp * 1e-9, *row])
+    except (AnyReaderError, OSError) as error:
+        raise UserError(f"{folder}: {error}") from error
+    lengths = {len(row) - 1 for row in commands}
+    if lengths != {len(joints)}:
+        raise UserError(f"{folder}: commands are for {sorted(lengths)} joints, and the robot has {len(joints)}")
+    return np.array(states).reshape(-1, 1 + 2 * len(joints)), np.array(commands)
+
+
+def _state(folder: Path, message: Any, joints: Sequence[str]) -> list[float] | None:
+    """Positions and velocities of a JointState in the robot's order; None where another part of it publishes."""
+    names = list(message.name)
+    if not set(names) & set(joints):
+        return None
+    for joint in joints:
+        if joint not in names:
+            raise UserError(f"{folder}: /joint_states has no joint '{joint}'{nearest(joint, names)}")
+    places = [names.index(joint) for joint in joints]
+    values = [list(getattr(message, key)) for key in ("position", "velocity")]
+    if any(len(each) != len(names) for each in values):
+        raise UserError(f"{folder}: /joint_states tells no positions or no velocities")
+    return [each[place] for each in values for place in places]
+
+
+def _check(path: Path, what: str, series: np.ndarray) -> None:
+    if len(series) < 2:
+        raise UserError(f"{path}: it holds {len(series)} {what}")
+    if not np.isfinite(series[:, 0]).all():
+        raise UserError(f"{path}: a time of its {what} is not finite")
+    back = np.diff(series[:, 0]).min()
+    if back < -_BACKWARDS:
+        at = int(np.diff(series[:, 0]).argmin()) + 1
+        raise UserError(f"{path}: the clock of its {what} goes back by {-back:.3g} s at number {at}")
+
+
+def _on_grid(path: Path, states: np.ndarray, commands: np.ndarray, joints: int, control_dt: float) -> Recording:
+    """Put what came at its own times on the steps of the robot's controller.
+
+    States are taken as those of the nearest step: a driver reads them at its own steady pace, and what jitters is when
+    they were sent. Several within a step leave the last one.
+    """
+    time = states[:, 0]
+    period = float(np.median(np.diff(time)))
+    if not 0.9 < period / control_dt < 1.1:
+        raise UserError(
+            f"{path}: joint states come every {period * 1e3:.3g} ms, and the control period of the env is "
+            f"{control_dt * 1e3:.3g} ms (env.control_dt)"
+        )
+    # Step by step, for a median is not so exact that it could be counted on for minutes.
+    step = np.concatenate([[0], np.cumsum(np.rint(np.diff(time) / period).astype(int))])
+    period = float((time[-1] - time[0]) / step[-1])
+    gridded = np.full((step[-1] + 1, states.shape[1] - 1), np.nan)
+    gridded[step] = states[:, 1:]
+    # What was in force until the next state: the last command before that. Without a next state, by the clock.
+    until = time[0] + period * np.arange(1, len(gridded) + 1)
+    until[step[1:] - 1] = time[1:]
+    tables = commands.shape[0] == states.shape[0] and np.array_equal(commands[:, 0], time)
+    last = np.searchsorted(commands[:, 0], until - (0.5 * period if tables else 0.0), side="left") - 1
+    given = np.where((last >= 0)[:, None], commands[np.maximum(last, 0), 1:], np.nan)
+    return Recording(period, gridded[:, :joints], gridded[:, joints:], given)

@@ -1,0 +1,126 @@
+"""Motions that begin at rest, cut out of a recording: what an identification predicts."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from physai.errors import UserError
+from physai.identify.recording import Recording
+
+_STILL = 25  # control steps with one command, after which a robot has come to rest
+_MEAN = 12  # of these steps, whose mean is where a motion begins
+_LONGEST = 200  # control steps; farther ahead, small errors grow and say little of parameters
+_SHORTEST = 10
+_FEWEST = 2  # motions: one to learn from, one to judge by
+_LEAST_NOISE = np.array([1e-5, 1e-4])  # rad, rad/s; encoders resolve no more
+_LEAST_MOTION = 20.0  # times the noise of positions, that each joint must move in some trial
+
+
+@dataclass(frozen=True)
+class Trials:
+    """B motions of T steps at most; what was not measured, and the end of shorter ones, is NaN.
+
+    Attributes:
+        start: Where the encoders said that the robot stood, rad, [B, n].
+        before: The command until then, [B, n].
+        command: In force from each step to the next, [T, B, n]; finite.
+        measured: Positions, rad, and velocities, rad/s, after each of these steps, [2, T, B, n].
+        noise: Standard deviations of both while the robot stood still, [2].
+        start_noise: Standard deviation of ``start``, which is a mean of few, rad.
+        left_out: Parts of the recording that could not be used, in words.
+    """
+
+    start: np.ndarray
+    before: np.ndarray
+    command: np.ndarray
+    measured: np.ndarray
+    noise: np.ndarray
+    start_noise: float
+    left_out: tuple[str, ...]
+
+    def __len__(self) -> int:
+        return len(self.start)
+
+
+def cut(recording: Recording, name: str, joints: Sequence[str]) -> Trials:
+    """Cut a recording wherever the robot has come to rest.
+
+    Args:
+        recording: At least two motions, each after half a second of rest.
+        name: Of the recording, for messages.
+        joints: Their names.
+
+    Raises:
+        UserError: If there are no two such motions, or a joint hardly moves in them.
+    """
+    motions, left_out = _motions(recording)
+    if len(motions) < _FEWEST:
+        rest = _STILL * recording.control_dt
+        raise UserError(
+            f"{name}: {len(motions)} motions begin at rest, and at least {_FEWEST} are needed: keep one command for "
+            f"{rest:g} s before each{''.join(f'; {each}' for each in left_out)}"
+        )
+    degrees = sum(len(each.rest[0]) - 1 for each in motions)
+    squares = np.sum([np.square(_about_mean(each.rest)).sum(axis=1).mean(axis=1) for each in motions], axis=0)
+    noise = np.maximum(np.sqrt(squares / degrees), _LEAST_NOISE)
+    start = np.stack([each.rest[0].mean(axis=0) for each in motions])
+
+    longest = max(each.last - each.first for each in motions)
+    command = np.empty((longest, len(motions), len(joints)))
+    measured = np.full((2, longest, len(motions), len(joints)), np.nan)
+    for number, each in enumerate(motions):
+        length = each.last - each.first
+        command[:, number] = recording.command[each.last - 1]
+        command[:length, number] = recording.command[each.first : each.last]
+        measured[:, :length, number] = _measured(recording)[:, each.first + 1 : each.last + 1]
+    ways = np.nanmax(np.abs(measured[0] - start), axis=(0, 1))
+    for joint, way in zip(joints, ways, strict=True):
+        if not way > _LEAST_MOTION * noise[0]:
+            raise UserError(f"{name}: '{joint}' moves by {way:.2g} rad at most: too little to tell anything of it")
+    before = recording.command[[each.first - 1 for each in motions]]
+    start_noise = float(noise[0] / np.sqrt(np.mean([len(each.rest[0]) for each in motions])))
+    return Trials(start, before, command, measured, noise, start_noise, tuple(left_out))
+
+
+@dataclass(frozen=True)
+class _Motion:
+    first: int  # step in which the command changes
+    last: int  # the first step that does not belong to it
+    rest: np.ndarray  # what was measured just before, [2, k, n]
+
+
+def _motions(recording: Recording) -> tuple[list[_Motion], list[str]]:
+    """Find the motions, and say what of the recording is left out."""
+    known = np.isfinite(recording.command).all(axis=1)
+    changed = np.ones(len(recording), dtype=bool)
+    changed[1:] = ~(known[1:] & known[:-1]) | (recording.command[1:] != recording.command[:-1]).any(axis=1)
+    changes = np.flatnonzero(changed)
+    begins = [int(step) for last, step in pairwise(changes) if step - last >= _STILL and known[step]]
+    motions, left_out = [], []
+    for first, following in zip(begins, [*begins, len(recording) - 1][1:], strict=True):
+        at = f"at {first * recording.control_dt:.2f} s"
+        last = min(following, first + _LONGEST)
+        unknown = np.flatnonzero(~known[first:last])
+        if len(unknown):
+            last = first + int(unknown[0])
+            left_out.append(f"{at}: no command is known from {last * recording.control_dt:.2f} s on")
+        rest = _measured(recording)[:, first - _MEAN + 1 : first + 1]
+        rest = rest[:, np.isfinite(rest).all(axis=(0, 2))]
+        if last - first < _SHORTEST:
+            left_out.append(f"{at}: too short")
+        elif len(rest[0]) < _MEAN // 2:
+            left_out.append(f"{at}: too little was measured at rest")
+        else:
+            motions.append(_Motion(first, last, rest))
+    return motions, left_out
+
+
+def _measured(recording: Recording) -> np.ndarray:
+    return np.stack([recording.position, recording.velocity])
+
+
+def _about_mean(values: np.ndarray) -> np.ndarray:
+    centred: np.ndarray = values - values.mean(axis=1, keepdims=True)
+    return centred

@@ -1,0 +1,73 @@
+"""Robots whose parameters nobody is told, and what is recorded of them."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from physai.envs.simulation import EnvConfig
+from physai.identify.recording import Recording
+from physai.physics import ParameterLayout, Physics, RandomizationConfig, RobotState
+from physai.robots import RobotSpec
+from physai.targets import make
+
+NOISE = 1e-3, 2e-2  # rad, rad/s
+
+
+@dataclass(frozen=True)
+class Hidden:
+    """A robot that was drawn, and a recording of it."""
+
+    spec: RobotSpec
+    layout: ParameterLayout
+    parameters: np.ndarray  # [P]
+    delay: int
+    recording: Recording
+
+
+def record(config: EnvConfig, draws: RandomizationConfig, kept: list[str], seconds: float, seed: int) -> Hidden:
+    """Draw a robot, all as described but for the parameters ``kept`` and its delay; let it jerk and rest in turns."""
+    spec = RobotSpec.from_config(config.robot)
+    layout = ParameterLayout(spec)
+    random = np.random.default_rng(seed)
+    drawn = draws.sample(1, layout, torch.Generator().manual_seed(seed)).double().numpy()
+    delay = int(drawn[0, layout.columns["actuator_delay"]][0])
+    for name, columns in layout.columns.items():
+        if name not in kept:
+            drawn[:, columns] = layout.nominal.double().numpy()[columns]
+    steps = round(seconds / config.control_dt)
+    command = jerks(steps, spec.velocity_limit, random)
+    physics: Physics = make("physics", config.physics, spec, 1, config.control_dt, needs=("reset", "step", "close"))
+    physics.reset(np.arange(1), RobotState(spec.home[None], np.zeros((1, len(spec.home)))), layout.dynamics(drawn))
+    measured = np.empty((2, steps, len(spec.home)))
+    for step in range(steps):
+        state = physics.robot_state()
+        measured[:, step] = state.joint_position[0], state.joint_velocity[0]
+        physics.step(command[max(step - delay, 0)][None])
+    physics.close()
+    measured[0] += drawn[0, layout.columns["encoder_offset"]]
+    measured += np.array(NOISE)[:, None, None] * random.standard_normal(measured.shape)
+    return Hidden(spec, layout, drawn[0], delay, Recording(config.control_dt, *measured, command))
+
+
+def jerks(steps: int, fastest: np.ndarray, random: np.random.Generator) -> np.ndarray:
+    """Velocity commands [steps, n] that saturate motors, with rests of 0.6 s at 50 Hz between motions."""
+    command = np.zeros((steps, len(fastest)))
+    step = 30
+    while step < steps - 100:
+        end = step + int(random.integers(60, 120))
+        while step < end:
+            after = min(step + int(random.integers(4, 25)), end, steps - 40)
+            command[step:after] = random.uniform(-1, 1, len(fastest)) * fastest * random.choice([0.3, 1.0])
+            step = max(after, step + 1)
+        step += 32
+    command[steps - 40 :] = 0.0
+    return command
+
+
+def write_table(recording: Recording, joints: tuple[str, ...], path: str) -> None:
+    """Write a recording as a CSV."""
+    names = [f"{what}[{joint}]" for what in ("position", "velocity", "command") for joint in joints]
+    time = recording.control_dt * np.arange(len(recording))[:, None]
+    rows = np.hstack([time, recording.position, recording.velocity, recording.command])
+    np.savetxt(path, rows, delimiter=",", header=",".join(["time", *names]), comments="", fmt="%.9g")

@@ -1,0 +1,72 @@
+"""What is found of hidden robots, and what is said of what cannot be."""
+
+from contextlib import closing
+
+import numpy as np
+import pytest
+
+from physai.compose import compose
+from physai.config import validate
+from physai.identify.fit import Predictor, fit
+from physai.identify.trials import cut
+from physai.identify.unknowns import Unknowns
+from physai.physics import RandomizationConfig
+from tests.identify.hidden import NOISE, record
+
+ALL = ["link_mass", "payload", "joint_damping", "joint_friction", "velocity_gain"]
+
+
+@pytest.fixture(scope="module")
+def strong():
+    return validate(RandomizationConfig, compose("train", ["randomization=strong"]).randomization)
+
+
+def found(hidden, physics, names, delays=range(5)):
+    trials = cut(hidden.recording, "robot", hidden.spec.joints)
+    unknowns = Unknowns.of(names, hidden.spec, hidden.layout)
+    with closing(Predictor(hidden.spec, physics, hidden.recording.control_dt, trials)) as predict:
+        return fit(predict, trials, unknowns, delays, 0, lambda _: None)
+
+
+@pytest.mark.slow
+def test_hidden_robots_are_found_within_their_intervals_and_what_holds_them_together_is_named(env_config, strong):
+    config = env_config("reacher", "physics=mujoco")
+    missed = told = 0
+    for seed in range(3):
+        hidden = record(config, strong, ALL, 15.0, seed)
+        result = found(hidden, config.physics, ALL)
+        assert result.delay == hidden.delay
+        assert result.explained
+        assert (result.after < 1.3 * NOISE[0]).all()
+        assert (result.after < 0.2 * result.before).all()
+        low, high = result.interval
+        truth = hidden.parameters[result.unknowns.columns]
+        missed += ((truth < low) | (truth > high))[result.told].sum()
+        told += result.told.sum()
+        of = dict(zip(result.unknowns.labels, result.told, strict=True))
+        assert of["link_mass[link1]"]
+        assert of["velocity_gain[joint2]"]
+        assert not of["link_mass[tool]"]  # its 50 g are at the tip, as a payload is
+        weights = np.abs(result.together[:, list(result.unknowns.labels).index("link_mass[tool]")])
+        assert weights.max() > 0.5
+    assert told >= 15
+    assert missed <= 0.2 * told  # one in twenty is to be expected
+
+
+@pytest.mark.slow
+def test_a_robot_that_the_engine_cannot_be_is_fitted_as_well_as_it_goes_and_the_mismatch_is_said(env_config, strong):
+    real = env_config("reacher", "physics=mujoco", "physics.motor=servo", "physics.armature=0.01")
+    hidden = record(real, strong, ALL, 30.0, 0)
+    result = found(hidden, env_config("reacher", "physics=mujoco").physics, ALL)
+    assert not result.explained
+    assert (result.after < 0.7 * result.before).all()
+
+
+def test_a_parameter_that_shows_in_no_motion_is_not_given_a_number(env_config, strong):
+    """A joint that turns without end about a vertical axis moves alike wherever its encoder's zero is."""
+    config = env_config("reacher", "physics=mujoco")
+    hidden = record(config, strong, ["encoder_offset"], 10.0, 1)
+    result = found(hidden, config.physics, ["encoder_offset", "velocity_gain"], range(hidden.delay, hidden.delay + 1))
+    of = dict(zip(result.unknowns.labels, result.unseen, strict=True))
+    assert of["encoder_offset[joint1]"]
+    assert not of["velocity_gain[joint1]"]

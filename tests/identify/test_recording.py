@@ -1,0 +1,134 @@
+"""Tables and recordings, whole and spoilt."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from physai.compose import compose
+from physai.config import validate
+from physai.errors import UserError
+from physai.identify.recording import Recording, read
+from physai.identify.trials import cut
+from physai.physics import RandomizationConfig
+from tests.identify.hidden import record, write_table
+
+TOPIC = "/joint_velocity_controller/commands"
+
+
+@pytest.fixture(scope="module")
+def hidden(env_config):
+    draws = validate(RandomizationConfig, compose("train", ["randomization=none"]).randomization)
+    return record(env_config("reacher", "physics=mujoco"), draws, [], 12.0, 0)
+
+
+@pytest.fixture
+def table(hidden, tmp_path):
+    path = tmp_path / "robot.csv"
+    write_table(hidden.recording, hidden.spec.joints, path)
+    return path
+
+
+def read_table(path):
+    return read(path, ("joint1", "joint2"), 0.02, TOPIC)
+
+
+def test_a_table_says_what_was_recorded(hidden, table):
+    seen = read_table(table)
+    for key in ("position", "velocity", "command"):
+        np.testing.assert_allclose(getattr(seen, key), getattr(hidden.recording, key), rtol=0, atol=1e-7)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "line"),
+    [
+        (lambda text: text.replace("position[joint2]", "position[joint_2]"), "no column 'position[joint2]'; did you"),
+        (lambda text: text.replace("time,", "stamp,"), "no column 'time'"),
+        (lambda text: text.replace("\n0.2,", "\nnoon,"), "column 'time' holds something that is no number"),
+        (lambda text: text.replace("\n4,", "\n1,"), "the clock of its joint states goes back by 2.98 s at number 200"),
+        (lambda text: text.replace("\n4,", "\n,"), "a time of its joint states is not finite"),
+        (lambda text: "\n".join(text.split("\n")[::2]), "come every 40 ms, and the control period of the env is 20 ms"),
+        (lambda text: text.split("\n")[0], "it holds 0 joint states"),
+        (lambda _: "", "No columns to parse"),
+    ],
+)
+def test_a_spoilt_table_is_refused_in_one_line(table, spoil, line):
+    table.write_text(spoil(table.read_text()))
+    with pytest.raises(UserError) as caught:
+        read_table(table)
+    assert line in str(caught.value)
+    assert len(str(caught.value).splitlines()) == 1
+
+
+def test_lost_rows_leave_gaps_and_the_rest_as_it_was(hidden, table):
+    lines = table.read_text().split("\n")
+    table.write_text("\n".join(line for number, line in enumerate(lines) if not 200 < number <= 204))
+    seen = read_table(table)
+    assert len(seen) == len(hidden.recording)
+    lost = np.isnan(seen.position).all(axis=1)
+    np.testing.assert_array_equal(np.flatnonzero(lost), range(200, 204))
+    np.testing.assert_allclose(seen.position[~lost], hidden.recording.position[~lost], rtol=0, atol=1e-7)
+
+
+def test_motions_begin_where_commands_change_after_a_rest(hidden):
+    trials = cut(hidden.recording, "robot", hidden.spec.joints)
+    assert len(trials) >= 3
+    assert not trials.before.any()
+    assert trials.command[0].any(axis=1).all()
+    np.testing.assert_allclose(trials.noise, [1e-3, 2e-2], rtol=0.25)
+    assert np.isfinite(trials.measured).any(axis=(0, 1, 3)).all()
+
+
+def test_a_motion_ends_where_a_command_is_not_known_and_it_is_said(hidden):
+    command = hidden.recording.command.copy()
+    whole = cut(hidden.recording, "robot", hidden.spec.joints)
+    first = int(np.flatnonzero(command.any(axis=1))[0])
+    command[first + 20] = np.nan
+    trials = cut(dataclasses.replace(hidden.recording, command=command), "robot", hidden.spec.joints)
+    assert len(trials) == len(whole)
+    assert np.isfinite(trials.measured[0, :, 0, 0]).sum() == 20
+    assert trials.left_out == (f"at {first * 0.02:.2f} s: no command is known from {first * 0.02 + 0.4:.2f} s on",)
+
+
+@pytest.mark.parametrize(
+    ("change", "line"),
+    [
+        (lambda command, position: (np.sin(np.arange(len(command)))[:, None] + command, position), "0 motions begin"),
+        (lambda command, position: (command, position[:20].repeat(len(command) // 20, axis=0)), "'joint1' moves by"),
+    ],
+)
+def test_motions_that_tell_nothing_are_refused_in_one_line(hidden, change, line):
+    recording = hidden.recording
+    command, position = change(recording.command, recording.position)
+    with pytest.raises(UserError, match=line) as caught:
+        cut(Recording(recording.control_dt, position, recording.velocity, command), "robot", hidden.spec.joints)
+    assert len(str(caught.value).splitlines()) == 1
+
+
+def test_a_recording_of_topics_says_the_same_as_a_table(hidden, tmp_path):
+    bags = pytest.importorskip("physai.ros.recording.bag")
+    recording, types = hidden.recording, bags.TYPES.types
+    bag = bags.Bag(tmp_path / "bag")
+    kinds = {"/joint_states": "sensor_msgs/msg/JointState", TOPIC: "std_msgs/msg/Float64MultiArray"}
+    for topic, kind in kinds.items():
+        bag.add(topic, kind)
+    header = types["std_msgs/msg/Header"](types["builtin_interfaces/msg/Time"](0, 0), "")
+    layout = types["std_msgs/msg/MultiArrayLayout"]([], 0)
+    nothing = np.empty(0)
+    random = np.random.default_rng(0)
+    for step in range(len(recording)):
+        at = round((100.0 + 0.02 * step + random.uniform(0.0, 0.002)) * 1e9)
+        # The driver has more joints, in another order.
+        position, velocity = (np.append(values[step][::-1], 7.0) for values in (recording.position, recording.velocity))
+        states = types[kinds["/joint_states"]](header, ["joint2", "joint1", "finger"], position, velocity, nothing)
+        command = types[kinds[TOPIC]](layout, recording.command[step])
+        for topic, late, message in (("/joint_states", 0, states), (TOPIC, 1_000_000, command)):
+            bag.write(topic, kinds[topic], at + late, bytes(bags.TYPES.serialize_cdr(message, kinds[topic])))
+    bag.close()
+    seen = read_table(tmp_path / "bag")
+    for key in ("position", "velocity", "command"):
+        np.testing.assert_allclose(getattr(seen, key), getattr(recording, key), rtol=0, atol=1e-7)
+    with pytest.raises(UserError, match="has no joint 'elbow'"):
+        read(tmp_path / "bag", ("joint1", "elbow"), 0.02, TOPIC)
+    with pytest.raises(UserError, match="it holds no /other"):
+        read(tmp_path / "bag", ("joint1", "joint2"), 0.02, "/other")
