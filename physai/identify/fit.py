@@ -164,16 +164,15 @@ class _Problem:
 
     def __init__(self, predict: Predictor, trials: Trials, unknowns: Unknowns) -> None:
         self._predict, self._trials, self._unknowns = predict, trials, unknowns
-        held_out = (
-            np.arange(len(trials)) % _EVERY == _EVERY - 1 if len(trials) >= _EVERY else np.arange(len(trials)) == 1
-        )
+        every = min(_EVERY, len(trials))
+        held_out = np.arange(len(trials)) % every == every - 1
         measured = np.isfinite(trials.measured)
         self._fitted = measured & ~held_out[:, None]
         self._held_out = measured & held_out[:, None]
         self._noise = trials.noise[:, None, None, None]
-        self._begins = np.full(trials.start.size, np.inf)
-        self.low = np.concatenate([unknowns.low, -self._begins])
-        self.high = np.concatenate([unknowns.high, self._begins])
+        anywhere = np.full(trials.start.size, np.inf)
+        self.low = np.concatenate([unknowns.low, -anywhere])
+        self.high = np.concatenate([unknowns.high, anywhere])
 
     def inside(self, coordinates: np.ndarray) -> np.ndarray:
         """Move them a little into their bounds, as scipy wants it."""

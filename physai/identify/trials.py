@@ -13,7 +13,7 @@ _STILL = 25  # control steps with one command, after which a robot has come to r
 _MEAN = 12  # of these steps, whose mean is where a motion begins
 _LONGEST = 200  # control steps; farther ahead, small errors grow and say little of parameters
 _SHORTEST = 10
-_FEWEST = 2  # motions: one to learn from, one to judge by
+_FEWEST, _MOST = 2, 40  # motions: one to learn from, one to judge by; and more hardly tell more
 _LEAST_NOISE = np.array([1e-5, 1e-4])  # rad, rad/s; encoders resolve no more
 _LEAST_MOTION = 20.0  # times the noise of positions, that each joint must move in some trial
 
@@ -62,6 +62,9 @@ def cut(recording: Recording, name: str, joints: Sequence[str]) -> Trials:
             f"{name}: {len(motions)} motions begin at rest, and at least {_FEWEST} are needed: keep one command for "
             f"{rest:g} s before each{''.join(f'; {each}' for each in left_out)}"
         )
+    if len(motions) > _MOST:
+        left_out.append(f"all but {_MOST} of {len(motions)} motions, spread over the whole time")
+        motions = [motions[number] for number in np.linspace(0, len(motions) - 1, _MOST).round().astype(int)]
     degrees = sum(len(each.rest[0]) - 1 for each in motions)
     squares = np.sum([np.square(_about_mean(each.rest)).sum(axis=1).mean(axis=1) for each in motions], axis=0)
     noise = np.maximum(np.sqrt(squares / degrees), _LEAST_NOISE)

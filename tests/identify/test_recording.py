@@ -90,6 +90,13 @@ def test_a_motion_ends_where_a_command_is_not_known_and_it_is_said(hidden):
     assert trials.left_out == (f"at {first * 0.02:.2f} s: no command is known from {first * 0.02 + 0.4:.2f} s on",)
 
 
+def test_of_a_long_recording_motions_from_all_over_it_are_used(hidden):
+    again = {key: np.tile(getattr(hidden.recording, key), (15, 1)) for key in ("position", "velocity", "command")}
+    trials = cut(dataclasses.replace(hidden.recording, **again), "robot", hidden.spec.joints)
+    assert len(trials) == 40
+    assert "all but 40 of" in trials.left_out[-1]
+
+
 @pytest.mark.parametrize(
     ("change", "line"),
     [
