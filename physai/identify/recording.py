@@ -142,7 +142,7 @@ def _on_grid(path: Path, states: np.ndarray, commands: np.ndarray, joints: int, 
     if not 0.9 < period / control_dt < 1.1:
         raise UserError(
             f"{path}: joint states come every {period * 1e3:.3g} ms, and the control period of the env is "
-            f"{control_dt * 1e3:.3g} ms (env.control_dt)"
+            f"{control_dt * 1e3:.3g} ms: env.control_dt={period:.2g} makes them one"
         )
     # Step by step, for a median is not so exact that it could be counted on for minutes.
     step = np.concatenate([[0], np.cumsum(np.rint(np.diff(time) / period).astype(int))])

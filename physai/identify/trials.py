@@ -9,10 +9,12 @@ import numpy as np
 from physai.errors import UserError
 from physai.identify.recording import Recording
 
-_STILL = 25  # control steps with one command, after which a robot has come to rest
-_MEAN = 12  # of these steps, whose mean is where a motion begins
-_LONGEST = 200  # control steps; farther ahead, small errors grow and say little of parameters
-_SHORTEST = 10
+_STILL = 0.5  # s with one command, after which a robot has come to rest
+_MEAN = 0.24  # s of this, whose mean is where a motion begins
+_LONGEST = 4.0  # s; farther ahead, small errors grow and say little of parameters
+_SHORTEST = 0.2  # s
+_CREEPS = 4.0  # standard deviations of what noise does to a mean; and at least, rad and rad/s:
+_RESTING = np.array([2e-4, 2e-3])
 _FEWEST, _MOST = 2, 40  # motions: one to learn from, one to judge by; and more hardly tell more
 _LEAST_NOISE = np.array([1e-5, 1e-4])  # rad, rad/s; encoders resolve no more
 _LEAST_MOTION = 20.0  # times the noise of positions, that each joint must move in some trial
@@ -57,10 +59,9 @@ def cut(recording: Recording, name: str, joints: Sequence[str]) -> Trials:
     """
     motions, left_out = _motions(recording)
     if len(motions) < _FEWEST:
-        rest = _STILL * recording.control_dt
         raise UserError(
             f"{name}: {len(motions)} motions begin at rest, and at least {_FEWEST} are needed: keep one command for "
-            f"{rest:g} s before each{''.join(f'; {each}' for each in left_out)}"
+            f"{_STILL:g} s before each{''.join(f'; {each}' for each in left_out)}"
         )
     if len(motions) > _MOST:
         left_out.append(f"all but {_MOST} of {len(motions)} motions, spread over the whole time")
@@ -100,24 +101,39 @@ def _motions(recording: Recording) -> tuple[list[_Motion], list[str]]:
     changed = np.ones(len(recording), dtype=bool)
     changed[1:] = ~(known[1:] & known[:-1]) | (recording.command[1:] != recording.command[:-1]).any(axis=1)
     changes = np.flatnonzero(changed)
-    begins = [int(step) for last, step in pairwise(changes) if step - last >= _STILL and known[step]]
+    still, mean, longest, shortest = (
+        round(seconds / recording.control_dt) for seconds in (_STILL, _MEAN, _LONGEST, _SHORTEST)
+    )
+    begins = [int(step) for last, step in pairwise(changes) if step - last >= still and known[step]]
     motions, left_out = [], []
     for first, following in zip(begins, [*begins, len(recording) - 1][1:], strict=True):
         at = f"at {first * recording.control_dt:.2f} s"
-        last = min(following, first + _LONGEST)
+        last = min(following, first + longest)
         unknown = np.flatnonzero(~known[first:last])
         if len(unknown):
             last = first + int(unknown[0])
             left_out.append(f"{at}: no command is known from {last * recording.control_dt:.2f} s on")
-        rest = _measured(recording)[:, first - _MEAN + 1 : first + 1]
+        rest = _measured(recording)[:, first - mean + 1 : first + 1]
         rest = rest[:, np.isfinite(rest).all(axis=(0, 2))]
-        if last - first < _SHORTEST:
+        if last - first < shortest:
             left_out.append(f"{at}: too short")
-        elif len(rest[0]) < _MEAN // 2:
+        elif len(rest[0]) < max(mean // 2, 4):
             left_out.append(f"{at}: too little was measured at rest")
+        elif not _rests(rest):
+            left_out.append(f"{at}: the robot still moves when it begins")
         else:
             motions.append(_Motion(first, last, rest))
     return motions, left_out
+
+
+def _rests(measured: np.ndarray) -> bool:
+    """Whether the two halves of what was measured, [2, k, n], differ by no more than noise makes them."""
+    half = len(measured[0]) // 2
+    first, second = measured[:, :half], measured[:, half : 2 * half]
+    noise = np.sqrt((first.var(axis=1, ddof=1) + second.var(axis=1, ddof=1)) / half)  # of the difference of means
+    creeps = np.abs(second.mean(axis=1) - first.mean(axis=1)) > np.maximum(_CREEPS * noise, _RESTING[:, None])
+    moves = np.abs(measured[1].mean(axis=0)) > np.maximum(_CREEPS * noise[1], _RESTING[1])
+    return not (creeps[0].any() or moves.any())
 
 
 def _measured(recording: Recording) -> np.ndarray:

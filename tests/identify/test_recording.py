@@ -79,6 +79,19 @@ def test_motions_begin_where_commands_change_after_a_rest(hidden):
     assert np.isfinite(trials.measured).any(axis=(0, 1, 3)).all()
 
 
+def test_who_moves_steadily_does_not_rest(hidden):
+    """One velocity command for long is no rest."""
+    recording = hidden.recording
+    command, position = recording.command.copy(), recording.position.copy()
+    first = int(np.flatnonzero(command.any(axis=1))[0])
+    whole = cut(recording, "robot", hidden.spec.joints)
+    command[:first] = 0.5
+    position[:first] -= 0.5 * recording.control_dt * np.arange(first, 0, -1)[:, None]
+    steady = cut(dataclasses.replace(recording, command=command, position=position), "robot", hidden.spec.joints)
+    assert len(steady) == len(whole) - 1
+    assert steady.left_out == (f"at {first * 0.02:.2f} s: the robot still moves when it begins",)
+
+
 def test_a_motion_ends_where_a_command_is_not_known_and_it_is_said(hidden):
     command = hidden.recording.command.copy()
     whole = cut(hidden.recording, "robot", hidden.spec.joints)
