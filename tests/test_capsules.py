@@ -71,6 +71,7 @@ def test_capsules_are_written_and_drawn_and_a_robot_takes_them(tmp_path, run):
     assert (alarm & ~touching).mean() < 0.08
 
 
+@pytest.mark.slow
 def test_links_that_capsules_cannot_tell_apart_are_left_out_and_named(tmp_path, run):
     disc = FOOT.replace("<geometry>", '<origin xyz="0 0 {z}" rpy="1.5708 0 0"/><geometry>')
     path = write_arm(tmp_path, disc.format(z=0.2), "", disc.format(z=0.0), "")

@@ -110,6 +110,7 @@ def test_what_is_said_to_shorten_the_errors_does(simulate, name):
         assert (task.error(state_at(q + step), goal)[:, column] < before[:, column]).mean() > 0.95
 
 
+@pytest.mark.slow
 @torch.no_grad()
 def test_the_suggested_way_leads_from_goal_to_goal_and_seldom_touches_anything(simulate):
     simulation = simulate("panda_pose")
