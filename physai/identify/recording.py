@@ -11,7 +11,7 @@ import pandas as pd
 from physai.config import nearest
 from physai.errors import UserError
 
-_BACKWARDS = 1e-4  # s; a clock that goes back by more has been set
+_BACKWARDS, _FORWARDS = 1e-4, 600.0  # s; a clock that goes back or on by more at once has been set
 _WHAT = ("position", "velocity", "command")
 
 
@@ -125,10 +125,12 @@ def _check(path: Path, what: str, series: np.ndarray) -> None:
         raise UserError(f"{path}: it holds {len(series)} {what}")
     if not np.isfinite(series[:, 0]).all():
         raise UserError(f"{path}: a time of its {what} is not finite")
-    back = np.diff(series[:, 0]).min()
-    if back < -_BACKWARDS:
-        at = int(np.diff(series[:, 0]).argmin()) + 1
-        raise UserError(f"{path}: the clock of its {what} goes back by {-back:.3g} s at number {at}")
+    steps = np.diff(series[:, 0])
+    jumps = np.flatnonzero((steps < -_BACKWARDS) | (steps > _FORWARDS))
+    if len(jumps):
+        by, at = steps[jumps[0]], jumps[0] + 1
+        way = "back" if by < 0 else "on"
+        raise UserError(f"{path}: the clock of its {what} goes {way} by {abs(by):.3g} s at number {at}")
 
 
 def _on_grid(path: Path, states: np.ndarray, commands: np.ndarray, joints: int, control_dt: float) -> Recording:
@@ -155,4 +157,6 @@ def _on_grid(path: Path, states: np.ndarray, commands: np.ndarray, joints: int, 
     tables = commands.shape[0] == states.shape[0] and np.array_equal(commands[:, 0], time)
     last = np.searchsorted(commands[:, 0], until - (0.5 * period if tables else 0.0), side="left") - 1
     given = np.where((last >= 0)[:, None], commands[np.maximum(last, 0), 1:], np.nan)
+    if tables:  # with a row its command is lost
+        given[np.setdiff1d(np.arange(len(given)), step)] = np.nan
     return Recording(period, gridded[:, :joints], gridded[:, joints:], given)

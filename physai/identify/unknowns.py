@@ -19,8 +19,7 @@ FITTED = (
     "velocity_gain",
     "encoder_offset",
 )
-_IN_PARTS = ("link_mass", "joint_damping", "effort_limit")  # found as a factor of what the description says
-_FACTOR = 1.0  # of e: one unit of their coordinates
+_IN_PARTS = ("link_mass", "joint_damping", "effort_limit")  # found as a factor of the description; one unit is e
 _PAYLOAD, _OFFSET, _GAIN = 0.3, 0.02, 0.3  # kg, rad, 1: one unit of theirs
 _FRICTION = 0.05  # of the effort limit: one unit of friction
 _FARTHEST = 4.0  # units
@@ -35,14 +34,12 @@ class Unknowns:
 
     Attributes:
         labels: A name for each, such as ``link_mass[link1]``.
-        names: The parameter that each belongs to.
         columns: Where they stand, [F].
         low: Smallest coordinates, [F].
         high: Largest, [F].
     """
 
     labels: tuple[str, ...]
-    names: tuple[str, ...]
     columns: np.ndarray
     low: np.ndarray
     high: np.ndarray
@@ -77,7 +74,7 @@ class Unknowns:
             labels += [layout.labels[place] for place in places]
             each += [name] * len(places)
             columns += places
-            unit += [_FACTOR] * len(places) if name in _IN_PARTS else units[name].tolist()
+            unit += [1.0] * len(places) if name in _IN_PARTS else units[name].tolist()
         at = nominal[columns]
         in_parts = np.isin(each, _IN_PARTS)
         low, high = np.full(len(each), -_FARTHEST), np.full(len(each), _FARTHEST)
@@ -90,7 +87,7 @@ class Unknowns:
             rows = np.array(each) == name
             low[rows] = np.maximum(low[rows], (least - at[rows]) / scale[rows])
             high[rows] = np.minimum(high[rows], (most - at[rows]) / scale[rows])
-        return cls(tuple(labels), tuple(each), np.array(columns), low, high, nominal, scale, in_parts)
+        return cls(tuple(labels), np.array(columns), low, high, nominal, scale, in_parts)
 
     def __len__(self) -> int:
         return len(self.labels)

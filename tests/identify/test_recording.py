@@ -46,6 +46,7 @@ def test_a_table_says_what_was_recorded(hidden, table):
         (lambda text: text.replace("time,", "stamp,"), "no column 'time'"),
         (lambda text: text.replace("\n0.2,", "\nnoon,"), "column 'time' holds something that is no number"),
         (lambda text: text.replace("\n4,", "\n1,"), "the clock of its joint states goes back by 2.98 s at number 200"),
+        (lambda text: text.replace("\n4,", "\n4000,"), "goes on by 4e+03 s at number 200"),
         (lambda text: text.replace("\n4,", "\n,"), "a time of its joint states is not finite"),
         (lambda text: "\n".join(text.split("\n")[::2]), "come every 40 ms, and the control period of the env is 20 ms"),
         (lambda text: text.split("\n")[0], "it holds 0 joint states"),
@@ -60,13 +61,14 @@ def test_a_spoilt_table_is_refused_in_one_line(table, spoil, line):
     assert len(str(caught.value).splitlines()) == 1
 
 
-def test_lost_rows_leave_gaps_and_the_rest_as_it_was(hidden, table):
+def test_with_lost_rows_their_commands_are_lost_and_the_rest_is_as_it_was(hidden, table):
     lines = table.read_text().split("\n")
     table.write_text("\n".join(line for number, line in enumerate(lines) if not 200 < number <= 204))
     seen = read_table(table)
     assert len(seen) == len(hidden.recording)
     lost = np.isnan(seen.position).all(axis=1)
     np.testing.assert_array_equal(np.flatnonzero(lost), range(200, 204))
+    np.testing.assert_array_equal(np.isnan(seen.command).all(axis=1), lost)
     np.testing.assert_allclose(seen.position[~lost], hidden.recording.position[~lost], rtol=0, atol=1e-7)
 
 
