@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 ARGS ?=
 
-.PHONY: help train demo test bench check format docs build clean
+.PHONY: help train demo fleet chromium test bench check format docs build clean
 help:  ## Show this help
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## (.*)/  make \1\t\2/'
 
@@ -17,22 +17,22 @@ $(BIN)/python:
 
 $(VENV)/.installed: pyproject.toml constraints.txt | $(BIN)/python
 	@echo "==> Installing physai into $(VENV)"
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[mujoco,onnx]'
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[mujoco,onnx,web]'
 	@touch $@
 
 $(VENV)/.installed-ros: $(VENV)/.installed
 	@echo "==> Installing ROS 2 Jazzy into $(VENV)"
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[mujoco,onnx,ros]'
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[mujoco,onnx,ros,web]'
 	@touch $@
 
 $(VENV)/.installed-docs: $(VENV)/.installed
 	@echo "==> Installing the tools for the documentation into $(VENV)"
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[docs,mujoco,onnx,ros]'
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[docs,mujoco,onnx,ros,web]'
 	@touch $@
 
 $(VENV)/.installed-dev: $(VENV)/.installed
 	@echo "==> Installing the tools for tests and benchmarks into $(VENV)"
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev,bench,docs,joblib,mlflow,mujoco,onnx,optuna,ray,ray-launcher,ros,submitit,wandb]'
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev,bench,docs,foxglove,joblib,mlflow,mujoco,onnx,optuna,ray,ray-launcher,ros,submitit,wandb,web]'
 	@touch $@
 
 train: $(VENV)/.installed  ## Train the two-link arm (ARGS="env=kuka_reacher seed=1" for more)
@@ -43,8 +43,18 @@ demo: $(VENV)/.installed-ros  ## Let the newest policy drive a virtual robot ove
 	@echo "==> Driving"
 	$(BIN)/python -m physai.ros.demo $(ARGS)
 
+fleet: $(VENV)/.installed-ros  ## Let the newest policies drive eight virtual robots over ROS 2 (ARGS="arms=4")
+	@echo "==> Driving a fleet"
+	$(BIN)/python -m physai.ros.fleet $(ARGS)
+
+chromium:
+	@command -v chromium > /dev/null || { test "$$(id -u)" = 0 || \
+	  { echo "error: the tests open pages in Chromium: apt-get install chromium, then make test"; exit 2; }; \
+	  echo "==> Installing Chromium, in which the tests open pages" && apt-get update -qq -o Acquire::Retries=3 && \
+	  DEBIAN_FRONTEND=noninteractive apt-get install -qq -o Acquire::Retries=3 --yes --no-install-recommends chromium > /dev/null; }
+
 # A part of which ARGS choose no test (pytest's exit code 5) is no failure.
-test: $(VENV)/.installed-dev  ## Run all tests (ARGS="-m 'not slow'" for the quick ones)
+test: $(VENV)/.installed-dev chromium  ## Run all tests (ARGS="-m 'not slow'" for the quick ones)
 	@export PHYSAI_TEST_RUNS=$$(mktemp -d); trap 'rm -rf "$$PHYSAI_TEST_RUNS"' EXIT; \
 	part() { echo "==> Testing $$1"; shift; $(BIN)/python -m pytest "$$@" $(ARGS) || [ $$? = 5 ]; }; \
 	part "what is not ROS" -n 3 --dist worksteal --ignore tests/ros && \

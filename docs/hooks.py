@@ -21,7 +21,10 @@ PARAMETERS = {
     "inference_node": "physai.ros.inference_node.InferenceConfig",
     "command_watchdog": "physai.ros.command_watchdog.WatchdogConfig",
     "virtual_robot": "physai.ros.virtual_robot.VirtualRobotConfig",
+    "excite": "physai.ros.excite.ExciteConfig",
     "record": "physai.ros.record.RecordConfig",
+    "foxglove": "physai.ros.foxglove.FoxgloveConfig",
+    "dashboard": "physai.ros.dashboard.DashboardConfig",
 }
 """The dataclass that a table is made from, by the name that a page uses."""
 
@@ -59,14 +62,15 @@ def parameters(name: str) -> str:
     """A table of parameters: name, default, unit, what is allowed, and meaning.
 
     Args:
-        name: One of ``PARAMETERS``. For inference_node, those of the controller are left out: they are a table of
-            their own.
+        name: One of ``PARAMETERS``. What it has from the controller or the inference node is left out, unless it has
+            another default: these have tables of their own.
     """
     kind = parameter_class(name)
-    inherited = set() if name == "controller" else _names(parameter_class("controller"))
+    bases = [base for base in map(parameter_class, ("controller", "inference_node")) if base in kind.__mro__[1:]]
+    inherited = {(field.name, field.default) for base in bases for field in dataclasses.fields(base)}
     lines = ["| parameter | default | unit | allowed | meaning |", "|---|---|---|---|---|"]
     for field in dataclasses.fields(kind):
-        if field.name in inherited and issubclass(kind, parameter_class("controller")):
+        if (field.name, field.default) in inherited:
             continue
         star = " \\*" if field.metadata["fixed"] else ""
         cells = [f"`{field.name}`{star}", _default(field.default), field.metadata["unit"], _allowed(field)]
@@ -84,10 +88,6 @@ def configuration() -> str:
     for group, paths in groups.items():
         parts += [f"## {group}", *(_file(path) for path in paths)]
     return "\n\n".join(parts)
-
-
-def _names(kind: type[Parameters]) -> set[str]:
-    return {field.name for field in dataclasses.fields(kind)}
 
 
 def _default(value: Any) -> str:

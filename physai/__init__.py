@@ -23,7 +23,9 @@ _GYMNASIUM_IDS = {
     "PandaPose": "panda_pose",
     "Kuka7Reach": "kuka7_reach",
     "XarmReach": "xarm_reach",
+    "A1Walk": "a1_walk",
 }
+_WITHOUT_PLACES = ("A1Walk",)  # whose goals are not where an end effector can be
 
 
 def make_env(*args: Any, **kwargs: Any) -> "TransformedRobotEnv":
@@ -43,6 +45,8 @@ def _register() -> None:
             vector_entry_point="physai.envs.gym_env:RobotVectorEnv",
             kwargs={"env": env},
         )
+        if name in _WITHOUT_PLACES:
+            continue
         register(f"physai/{name}Goal-v0", entry_point="physai.envs.goal_env:GoalGymEnv", kwargs={"env": env})
     register(
         "physai/RosReach-v0",

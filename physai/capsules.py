@@ -45,7 +45,7 @@ def _check(node: DictConfig) -> None:
     config = validate(CapsulesConfig, node)
     if config.path.suffix != ".yaml":
         raise UserError(f"output: '{config.output}' must end in .yaml")
-    RobotSpec.from_config(config.robot)
+    RobotSpec.from_config(config.robot).need_fixed_base("fitting capsules to")
 
 
 def _fit(node: DictConfig, _: Path) -> None:

@@ -20,6 +20,7 @@ from hydra.errors import HydraException, MissingConfigException, OverrideParseEx
 from hydra.plugins.config_source import ConfigLoadError
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
+from yaml import YAMLError
 
 from physai.config import keys, nearest
 from physai.errors import UserError
@@ -122,12 +123,34 @@ def parse(overrides: Iterable[str]) -> list[Override]:
         raise UserError(f"'{error.override}' is not an override such as key=value") from error
 
 
+def _offer_files(overrides: Iterable[str]) -> None:
+    """Let Hydra find options that are files elsewhere, such as ``randomization=outputs/<id>/identified.yaml``."""
+    for override in parse(overrides):
+        group, option = override.get_key_element().lstrip("+"), override.value()
+        if not (isinstance(option, str) and option.endswith(".yaml") and (conf_dir() / group).is_dir()):
+            continue
+        if (conf_dir() / group / option.lstrip("/")).is_file():
+            continue
+        try:
+            node = OmegaConf.load(option)
+        except OSError as error:
+            raise UserError(f"{group}={option}: {error.strerror}") from error
+        except (YAMLError, UnicodeDecodeError, OmegaConfBaseException) as error:
+            raise UserError(f"{group}={option}: {' '.join(str(error).split())}") from error
+        if not isinstance(node, DictConfig):
+            raise UserError(f"{group}={option}: it holds no keys")
+        # The rooms of Hydra's register are called as it will look them up: without the empty name before a first slash.
+        parts = [part for part in option.split("/")[:-1] if part]
+        ConfigStore.instance().store(option.rpartition("/")[2], node, "/".join([group, *parts]))
+
+
 def compose(name: str, overrides: Iterable[str] = (), hydra: bool = False) -> DictConfig:
     """Compose ``conf/<name>.yaml`` with Hydra overrides.
 
     Args:
         name: A file in ``conf/``, without its ending.
-        overrides: As on the command line, such as ``env=reacher`` or ``algo.optimizer.lr=1e-3``.
+        overrides: As on the command line, such as ``env=reacher`` or ``algo.optimizer.lr=1e-3``; the option of a group
+            may be a YAML file of one's own, by its path.
         hydra: Keep the ``hydra`` node.
 
     Raises:
@@ -135,6 +158,7 @@ def compose(name: str, overrides: Iterable[str] = (), hydra: bool = False) -> Di
     """
     overrides = list(overrides)
     set_plugin_defaults()
+    _offer_files(overrides)
     with initialized(name):
         try:
             return hydra_compose(name, overrides, return_hydra_config=hydra)

@@ -30,6 +30,14 @@ PackageName = Annotated[str, Field(pattern=r"^[A-Za-z_]\w*(\.[A-Za-z_]\w*)*$", m
 PositiveFloat = Annotated[float, Field(gt=0)]
 NonNegativeFloat = Annotated[float, Field(ge=0)]
 
+
+class PageConfig(Config):
+    """Where a page for browsers is served: on an address of this computer, and a port; 0 takes a free one."""
+
+    host: str
+    port: Annotated[int, Field(ge=0, le=65535)]
+
+
 C = TypeVar("C", bound=Config)
 
 

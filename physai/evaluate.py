@@ -14,6 +14,7 @@ from physai.files import write_atomically
 
 if TYPE_CHECKING:
     from physai.envs.simulation import EnvConfig
+    from physai.physics import RandomizationConfig
     from physai.training.run import TrainedPolicy
 
 
@@ -28,15 +29,18 @@ class PolicyChoice(Config):
 
     def load(self, run: str) -> "TrainedPolicy":
         """Read it; raises a UserError if something is missing or damaged."""
-        from physai.physics import RandomizationConfig
         from physai.training.run import TrainedPolicy, load_config
 
         run_config = load_config(Path(run), self.allow)
         env = self._env(run_config.env)
-        randomization = None
-        if self.randomization is not None:
-            randomization = validate(RandomizationConfig, DictConfig(self.randomization))
-        return TrainedPolicy(Path(run), str(self.checkpoint), randomization, env, run_config)
+        return TrainedPolicy(Path(run), str(self.checkpoint), self._randomization(), env, run_config)
+
+    def _randomization(self) -> "RandomizationConfig | None":
+        from physai.physics import RandomizationConfig
+
+        if self.randomization is None:
+            return None
+        return validate(RandomizationConfig, DictConfig(self.randomization))
 
     def _env(self, run: "EnvConfig") -> "EnvConfig | None":
         """The robots, where they are not just the run's: in its engine, unless another is chosen or comes along."""

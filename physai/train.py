@@ -2,6 +2,7 @@
 
 import contextlib
 import gc
+import importlib.util
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -9,11 +10,15 @@ from typing import TYPE_CHECKING
 from omegaconf import DictConfig, OmegaConf
 
 from physai import cli
+from physai.config import not_installed
 from physai.errors import UserError
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from physai.training.agent import Agent
-    from physai.training.config import TrainConfig
+    from physai.training.callbacks import Watch
+    from physai.training.config import TrainConfig, WatchConfig
 
 
 def main() -> None:
@@ -40,6 +45,16 @@ def _config(node: DictConfig) -> "TrainConfig":
     return validate(TrainConfig, node)
 
 
+def _watching(node: DictConfig) -> "WatchConfig":
+    from physai.config import validate
+    from physai.training.config import WatchConfig
+
+    shown = validate(WatchConfig, OmegaConf.masked_copy(node, list(WatchConfig.model_fields)))
+    if shown.render == "web" and importlib.util.find_spec("viser") is None:
+        raise UserError(f"render=web needs {not_installed('viser')}")
+    return shown
+
+
 class Training:
     """Builds every part of a run, so that whatever is wrong shows before a run folder exists; then trains with them.
 
@@ -59,6 +74,7 @@ class Training:
 
         self.close()
         config = _config(node)
+        _watching(node)
         self._agent = Agent.build(config)
         if config.export.formats:
             script(make_deployable(self._agent.policy(), self._agent.env))  # what does not script cannot be exported
@@ -73,7 +89,7 @@ class Training:
     def train(self, node: DictConfig, run_dir: Path) -> None:
         """Train, and export the best policy."""
         agent, self._agent = self._agent, None
-        _train(_config(node), run_dir, agent=agent)
+        _train(_config(node), run_dir, _watching(node), agent=agent)
 
     def close(self) -> None:
         """Free what ``train`` did not take."""
@@ -104,7 +120,8 @@ def _resume(run_dir: Path, given: list[str]) -> None:
             if old != new and not (isinstance(old, dict) and isinstance(new, dict)):  # then a key in them differs, too
                 difference = f"{'.'.join(map(str, key))}={old}, not {new}"
                 raise UserError(f"resume={run_dir}: the run has {difference}; a resumed run keeps its config")
-    _train(config, run_dir, resume=True)
+    shown = [override for override in given if override.split("=")[0].split(".")[0] in ("render", "web")]
+    _train(config, run_dir, _watching(compose("train", shown)), resume=True)
 
 
 def _allowed(override: str) -> list[str]:
@@ -118,24 +135,43 @@ def _allowed(override: str) -> list[str]:
     return validate(Allowed, OmegaConf.masked_copy(compose("train", [override]), ["allow"])).allow
 
 
-def _train(config: "TrainConfig", run_dir: Path, resume: bool = False, agent: "Agent | None" = None) -> None:
+def _train(
+    config: "TrainConfig", run_dir: Path, shown: "WatchConfig", resume: bool = False, agent: "Agent | None" = None
+) -> None:
     """Train, draw the run, and export its policy."""
     from physai.training.run import run_training
 
     complete = (run_dir / "summary.json").is_file()
-    run_training(config, run_dir, resume, agent)
+    with _page(config, shown) as watch:
+        run_training(config, run_dir, resume, agent, watch)
     if not (complete and (run_dir / "training.png").is_file()):
-        _draw(run_dir)
+        _draw(config, run_dir)
     _export(config, run_dir, complete)
 
 
-def _draw(run_dir: Path) -> None:
-    from physai.plots.runs import plot_runs  # no frame needs to wait for Matplotlib
+@contextlib.contextmanager
+def _page(config: "TrainConfig", shown: "WatchConfig") -> "Iterator[Watch | None]":
+    """Context in which a page shows what is handed to it, if one is asked for."""
+    if shown.render is None:
+        yield None
+        return
+    from physai.web.training import TrainingPage
+
+    with contextlib.closing(TrainingPage(config.env, shown.web.host, shown.web.port)) as page:
+        print(f"The page: {page.address}", flush=True)
+        yield page.show
+
+
+def _draw(config: "TrainConfig", run_dir: Path) -> None:
+    from physai.plots.curriculum import plot_curriculum  # no frame needs to wait for Matplotlib
+    from physai.plots.runs import plot_runs
 
     try:
         plot_runs([run_dir], run_dir / "training.png")
     except UserError as error:
         print(f"No training.png: {error}")
+    if config.curriculum is not None:
+        plot_curriculum(run_dir, config.randomization, run_dir / "curriculum.png")
 
 
 def _export(config: "TrainConfig", run_dir: Path, complete: bool) -> None:

@@ -6,6 +6,7 @@ import shutil
 import signal
 import sys
 from collections.abc import Callable
+from contextlib import redirect_stdout
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -25,8 +26,8 @@ from physai.compose import compose, conf_dir
 from physai.config import validate
 from physai.envs.simulation import EnvConfig
 from physai.training.config import TrainConfig
-from physai.training.run import run_training
-from tests.training.small import SMALL, command
+from physai.training.run import load_config, run_training
+from tests.training.small import SMALL, TINY, command, run_here
 
 # A shell that starts the tests in the background has them, and whatever they start, take no notice of Ctrl-C.
 signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -116,14 +117,21 @@ def two_joint_env(request: pytest.FixtureRequest) -> EnvConfig:
     return _env_config(request.param)
 
 
-def _first_of_each_robot() -> list[str]:
-    robots = {_env_config(name).robot.name: name for name in reversed(_simulated_envs())}
+def _first_of_each_robot(floats: bool) -> list[str]:
+    configs = {name: _env_config(name).robot for name in reversed(_simulated_envs())}
+    robots = {robot.name: name for name, robot in configs.items() if (robot.floating is not None) == floats}
     return sorted(robots.values())
 
 
-@pytest.fixture(scope="session", params=_first_of_each_robot())
-def any_robot(request: pytest.FixtureRequest) -> EnvConfig:
-    """An environment of each robot in turn."""
+@pytest.fixture(scope="session", params=_first_of_each_robot(floats=False))
+def any_arm(request: pytest.FixtureRequest) -> EnvConfig:
+    """An environment of each robot whose base is fixed, in turn."""
+    return _env_config(request.param)
+
+
+@pytest.fixture(scope="session", params=_first_of_each_robot(floats=True))
+def any_legged(request: pytest.FixtureRequest) -> EnvConfig:
+    """An environment of each robot whose base floats, in turn."""
     return _env_config(request.param)
 
 
@@ -157,7 +165,10 @@ def once(tmp_path_factory: pytest.TempPathFactory, worker_id: str) -> Callable[[
 
 @pytest.fixture(scope="session")
 def exported_run(once: Callable[[str, Callable[[Path], None]], Path]) -> Path:
-    """A run of the reacher that reaches most goals, with policy.pt and policy.onnx; not to be written to."""
+    """A run of the reacher that reaches most goals, with policy.pt, policy.onnx, and what the export said, export.txt.
+
+    It is not to be written to.
+    """
     return once("exported_run", partial(_train_and_export, "total_frames=120_000"))
 
 
@@ -175,6 +186,13 @@ def recurrent_run(once: Callable[[str, Callable[[Path], None]], Path]) -> Path:
 
 
 @pytest.fixture(scope="session")
+def teacher_run(once: Callable[[str, Callable[[Path], None]], Path]) -> Path:
+    """The shortest run of a policy that sees the robot's parameters; a second, for what needs a teacher."""
+    tiny = (*TINY, "policy=privileged", "randomization=strong", "collector=single")
+    return once("teacher_run", lambda at: run_here(at / "run", *tiny)) / "run"
+
+
+@pytest.fixture(scope="session")
 def panda_run(once: Callable[[str, Callable[[Path], None]], Path]) -> Path:
     """A run of a Panda whose goals are positions in space."""
     return once("panda_run", partial(_train_and_export, "env=panda_reach", "physics=mujoco", "total_frames=320_000"))
@@ -186,11 +204,12 @@ def _train_and_export(*arguments: Any) -> None:
     (run / ".hydra").mkdir()
     (run / ".hydra" / "config.yaml").write_text(OmegaConf.to_yaml(node))
     run_training(validate(TrainConfig, node), run)
-    from physai.artifact import export  # it takes a second to import, which few tests need
+    from physai.artifact import export as module  # it takes a second to import, which few tests need
+    from physai.export import export
 
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(export, "TRANSFER_EPISODES", 100)
-        export.export_policy(run, "best", ["torchscript", "onnx"], episodes=100)
+    with pytest.MonkeyPatch.context() as patch, open(run / "export.txt", "w") as said, redirect_stdout(said):
+        patch.setattr(module, "TRANSFER_EPISODES", 100)
+        export(run, "best", ["torchscript", "onnx"], load_config(run))
 
 
 @pytest.fixture(scope="session")

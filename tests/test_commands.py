@@ -306,7 +306,7 @@ def test_an_env_that_is_chosen_stays_in_the_run_s_engine(run, copied):
         ),
         ("evaluate", [], "run=... is required"),
         ("play", ["run=run", "output=arm.avi"], "must end in .mp4 or .gif"),
-        ("play", ["run=run", "render=windw"], "render: input should be 'video' or 'human'"),
+        ("play", ["run=run", "render=windw"], "render: input should be 'video', 'human' or 'web'"),
         ("plot", ["runs=[nowhere]"], "nowhere: no run there"),
         ("export", [], "needed: run=<run folder> to export, or inspect=<policy.pt> to look at a policy"),
         ("export", ["run=run", "inspect=run/policy.pt"], "not both: run=<run folder> to export"),

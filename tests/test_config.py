@@ -58,13 +58,15 @@ def small(*overrides: str) -> TrainConfig:
     "override",
     [
         f"{group}={name}"
-        for group in (*BESIDE, "env", "algo", "randomization", "logger", "experiment")
+        for group in (*BESIDE, "env", "algo", "randomization", "curriculum", "logger", "experiment")
         for name in choices(group.partition("@")[0])
     ],
 )
-def test_every_choice_builds_and_collects(override):
+def test_every_choice_builds_and_collects(override, request):
     group, name = override.split("=")
     beside = [BESIDE[group](name)] if group in BESIDE else []
+    if OmegaConf.is_missing(compose("train", [*beside, override]).algo, "teacher"):
+        beside.append(f"algo.teacher={request.getfixturevalue('teacher_run')}")
     config = small(*beside, override)
     agent = Agent.build(config)
     batch = next(iter(agent.collector))
@@ -73,8 +75,13 @@ def test_every_choice_builds_and_collects(override):
     agent.close()
 
 
+def without_servo(robot: str) -> bool:
+    """Whether the joints of a robot are no springs, which take positions only."""
+    return compose("train", [f"robot@env.robot={robot}"]).env.robot.servo is None
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("robot", choices("robot"))
+@pytest.mark.parametrize("robot", filter(without_servo, choices("robot")))
 @pytest.mark.parametrize("command", ["joint_velocity", "joint_position"])
 def test_every_robot_can_be_driven_by_velocities_and_by_positions(robot, command):
     agent = Agent.build(
@@ -154,3 +161,34 @@ def test_counts_may_be_written_as_people_write_them():
     )
     assert (config.total_frames, config.algo["epochs"], config.algo["minibatch_size"]) == (1_000_000, 10, 1024)
     assert isinstance(config.algo["epochs"], int)
+
+
+@pytest.mark.parametrize("of", ["{}", "./{}", "/{}"])
+def test_a_file_of_one_s_own_is_an_option_by_its_path(tmp_path, monkeypatch, of):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "found").mkdir()
+    own = OmegaConf.merge(compose("train").randomization, {"name": "own"})
+    OmegaConf.save(own, tmp_path / "found" / "own.yaml")
+    path = of.format(f"{tmp_path}/found/own.yaml"[1:] if of.startswith("/") else "found/own.yaml")
+    assert compose("train", [f"randomization={path}"]).randomization == own
+    assert compose("evaluate", ["run=run", f"randomization={path}"]).randomization == own
+
+
+def test_a_file_of_conf_comes_before_one_of_the_same_name_in_this_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    OmegaConf.save({"name": "own"}, tmp_path / "strong.yaml")
+    assert compose("train", ["randomization=strong.yaml"]).randomization.name == "strong"
+
+
+@pytest.mark.parametrize(
+    ("text", "line"),
+    [(None, "No such file"), ("a: [1,", "expected"), ("- 1", "it holds no keys"), ("\x00", "special characters")],
+)
+def test_a_file_that_is_no_config_is_refused_in_one_line(tmp_path, monkeypatch, text, line):
+    monkeypatch.chdir(tmp_path)
+    if text is not None:
+        (tmp_path / "own.yaml").write_text(text)
+    with pytest.raises(UserError, match=line) as caught:
+        compose("train", ["randomization=own.yaml"])
+    assert str(caught.value).startswith("randomization=own.yaml: ")
+    assert len(str(caught.value).splitlines()) == 1

@@ -12,10 +12,10 @@ from omegaconf import OmegaConf
 
 from physai import artifact, cli, foreign, train
 from physai.compose import compose, conf_dir
-from physai.config import validate
+from physai.config import PageConfig, validate
 from physai.errors import UserError
 from physai.plots.runs import plot_runs
-from physai.training.config import TrainConfig
+from physai.training.config import TrainConfig, WatchConfig
 from physai.training.run import TrainedPolicy, load_config, run_training
 from tests import malicious
 from tests.training.small import EXPORTED, SMALL, command
@@ -175,7 +175,8 @@ def test_a_run_of_ones_own_parts_is_judged_and_exported_where_it_was_trained(own
 
     monkeypatch.setattr(artifact, "export_policy", export)
     config = validate(TrainConfig, compose("train", [*TINY, EXPORTED, "env.task._target_=mypackage.Mine"]))
-    train._train(config, own, resume=True)
+    unseen = WatchConfig(render=None, web=PageConfig(host="127.0.0.1", port=0))
+    train._train(config, own, unseen, resume=True)
     assert (own / "summary.json").is_file()
     assert exported == [config]
 

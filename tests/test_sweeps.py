@@ -65,7 +65,8 @@ def test_submitit_s_local_executor_runs_a_sweep_and_a_job_that_fails_is_named(tm
     assert "error: 1 of 2 runs failed" in output
 
 
-def test_ray_runs_a_sweep(tmp_path):
+def test_ray_runs_a_sweep(tmp_path, monkeypatch):
+    monkeypatch.setenv("RAY_worker_niceness", "0")  # it would wait for other tests
     code, output = run("hydra/launcher=ray", "seed=0,1", cwd=tmp_path)
     assert code == 0, output
     assert sorted(finished(tmp_path / "sweep")) == ["0", "1"]

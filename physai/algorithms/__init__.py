@@ -1,5 +1,6 @@
 """Learning from collected frames."""
 
+from physai.algorithms.distill import Distill, Teacher
 from physai.algorithms.interface import Algorithm, Networks, NonFiniteError
 from physai.algorithms.off_policy import OffPolicy
 from physai.algorithms.on_policy import OnPolicy
@@ -8,10 +9,12 @@ from physai.algorithms.proportional import ProportionalSampler
 
 __all__ = [
     "Algorithm",
+    "Distill",
     "FusedClipPPOLoss",
     "Networks",
     "NonFiniteError",
     "OffPolicy",
     "OnPolicy",
     "ProportionalSampler",
+    "Teacher",
 ]

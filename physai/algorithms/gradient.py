@@ -1,6 +1,6 @@
 """What all algorithms share: gradient steps on a TorchRL loss."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import torch
@@ -33,6 +33,27 @@ def check_ranges(where: str, module: nn.Module) -> None:
         value = getattr(module, name, None)
         if value is not None and not low <= float(value) <= high:
             raise UserError(f"{where}.{name}: must be between {low:g} and {high:g}, got {float(value):g}")
+
+
+def check_minibatch(minibatch_size: int, frames_per_batch: int) -> None:
+    """Raise a UserError if a minibatch is larger than a batch."""
+    if minibatch_size > frames_per_batch:
+        raise UserError(
+            f"algo.minibatch_size: a minibatch of {minibatch_size} is larger than a batch, "
+            f"collector.frames_per_batch={frames_per_batch}"
+        )
+
+
+def sequences(frames: TensorDictBase, minibatch_size: int) -> Iterator[TensorDictBase]:
+    """Whole rows of frames [N, T], in another order at each call; what is left over at the end is not handed out.
+
+    Args:
+        frames: N sequences of T steps.
+        minibatch_size: A minibatch is as many sequences as have so many steps, at least one.
+    """
+    robots, steps = frames.shape
+    order = torch.randperm(robots).split(max(1, minibatch_size // steps))
+    return (frames[rows] for rows in order if len(rows) == len(order[0]))
 
 
 class GradientAlgorithm:

@@ -10,10 +10,12 @@ from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LRScheduler
 from torchrl.data import TensorDictReplayBuffer
 
-from physai.algorithms.gradient import GradientAlgorithm, check_ranges
+from physai.algorithms.gradient import GradientAlgorithm, check_minibatch, check_ranges, sequences
 from physai.algorithms.interface import Networks
 from physai.config import Count, PositiveFloat
 from physai.errors import UserError
+
+_RATES = 1e-5, 1e-3  # of learning, if it follows from how far the policy moves
 
 
 class OnPolicy(GradientAlgorithm):
@@ -34,6 +36,10 @@ class OnPolicy(GradientAlgorithm):
         scheduler: Makes the learning-rate schedule from the optimizer; it steps once a batch.
         epochs: Passes over each batch.
         max_grad_norm: Gradients are clipped to this norm.
+        target_kl: How far the policy shall move in a batch, nats (``kl_approx``, the mean over all its minibatches):
+            twice as far makes the learning rate 1.5 times smaller, half as far 1.5 times larger, within 1e-5 and 1e-3
+            (Rudin et al., "Learning to Walk in Minutes Using Massively Parallel Deep Reinforcement Learning", CoRL
+            2021). None leaves the rate to the schedule.
     """
 
     warmup_frames = 0
@@ -50,12 +56,9 @@ class OnPolicy(GradientAlgorithm):
         scheduler: Callable[..., LRScheduler] | None,
         epochs: Count,
         max_grad_norm: PositiveFloat,
+        target_kl: PositiveFloat | None = None,
     ) -> None:
-        if minibatch_size > frames_per_batch:
-            raise UserError(
-                f"algo.minibatch_size: a minibatch of {minibatch_size} is larger than a batch, "
-                f"collector.frames_per_batch={frames_per_batch}"
-            )
+        check_minibatch(minibatch_size, frames_per_batch)
         drawn, held = buffer.batch_size, buffer.storage.max_size
         if drawn != frames_per_batch or held < frames_per_batch:
             raise UserError(
@@ -68,6 +71,9 @@ class OnPolicy(GradientAlgorithm):
         self.advantage = advantage(value_network=networks.critic)
         check_ranges("algo.advantage", self.advantage)
         super().__init__(made, optimizer, scheduler, max_grad_norm)
+        if target_kl is not None and "kl_approx" not in self.loss.out_keys:
+            raise UserError("algo.target_kl: this loss does not say how far the policy moves ('kl_approx')")
+        self._target_kl = target_kl
         self.buffer = buffer
         self.minibatch_size = minibatch_size
         self._device = networks.device
@@ -94,20 +100,25 @@ class OnPolicy(GradientAlgorithm):
             self.buffer.extend(frames.reshape(-1))
         results: list[TensorDictBase] = []
         for _ in range(self.epochs):
-            for minibatch in self._sequences(frames) if self._in_sequences else self._minibatches():
+            in_order = sequences(frames, self.minibatch_size) if self._in_sequences else self._minibatches()
+            for minibatch in in_order:
                 losses = self.loss(minibatch)
                 results.append(losses.set("grad_norm", self.step(losses, minibatch)))
         with torch.no_grad():
             means: TensorDictBase = torch.stack(results).mean(dim=0)
             metrics = {key: float(value) for key, value in means.items()}
             metrics["explained_variance"] = _explained_variance(*(batch.get(key) for key in self._judged))
-        return metrics | {"lr": self.end_batch()}
+        metrics["lr"] = self.end_batch()
+        if self._target_kl is not None:
+            self._adapt(metrics["kl_approx"] / self._target_kl)
+        return metrics
 
-    def _sequences(self, frames: TensorDictBase) -> Iterator[TensorDictBase]:
-        """Whole rows of frames [N, T], in another order for each epoch."""
-        robots, steps = frames.shape
-        order = torch.randperm(robots).split(max(1, self.minibatch_size // steps))
-        return (frames[rows] for rows in order if len(rows) == len(order[0]))
+    def _adapt(self, share: float) -> None:
+        """Change the learning rate, after this share of the way that the policy should have gone."""
+        if 0.5 <= share <= 2.0:
+            return
+        for group in self.optimizer.param_groups:
+            group["lr"] = min(max(group["lr"] * (1.5 if share < 0.5 else 1 / 1.5), _RATES[0]), _RATES[1])
 
     def _minibatches(self) -> Iterator[TensorDictBase]:
         # One draw an epoch, and slices of it: drawing each minibatch from the buffer takes eight times as long.

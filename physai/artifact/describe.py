@@ -16,6 +16,8 @@ from physai.artifact.states import States
 from physai.collision import CollisionModel
 from physai.deploy.metadata import FORMAT, FORMAT_VERSION, describe_region, describe_signal
 from physai.envs.simulation import Simulation
+from physai.robots import RobotSpec
+from physai.robots.chain import motions
 
 
 def describe_robot(simulation: Simulation, policy: DeployablePolicy) -> dict[str, Any]:
@@ -42,8 +44,15 @@ def describe_robot(simulation: Simulation, policy: DeployablePolicy) -> dict[str
             "region": describe_region(task.region),
             "tolerances": [vars(tolerance) for tolerance in task.tolerances],
         },
+        "kinematics": _kinematics(spec),
         "collision": None if (model := capsules(simulation)) is None else model.describe(),
     }
+
+
+def _kinematics(spec: RobotSpec) -> dict[str, Any]:
+    """What each joint moves, and where the end effector is in the frame of the last: for pictures."""
+    moves, tip = motions(spec.chain, spec.joints)
+    return {key: getattr(moves, key).tolist() for key in ("constant", "cosine", "sine")} | {"tip": tip.tolist()}
 
 
 def capsules(simulation: Simulation) -> CollisionModel | None:

@@ -5,9 +5,12 @@ import json
 import tempfile
 from collections.abc import Callable, Sequence
 from contextlib import closing
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
+from tensordict.nn import TensorDictModuleBase
 
 from physai.artifact import describe, gate, onnx, transfer
 from physai.artifact.module import DeployablePolicy, make_deployable, save, script
@@ -16,6 +19,8 @@ from physai.deploy import Metadata, PolicyError, load_policy
 from physai.deploy.archive import content_sha256
 from physai.deploy.metadata import metadata_sha256
 from physai.deploy.policy import load_module
+from physai.envs.make import TransformedRobotEnv
+from physai.envs.simulation import Simulation
 from physai.errors import UserError
 from physai.files import write_atomically
 from physai.seeding import derive
@@ -57,52 +62,21 @@ def export_policy(
         UserError: If there is no such policy, or it cannot be exported.
     """
     trained = TrainedPolicy(run_dir, which, config=config)
+    if trained.config.export.transfer == "require":
+        try:
+            transfer.other_engine(trained.config.env.physics)
+        except UserError as error:
+            raise gate.GateError(f"export.transfer=require: {error}") from error
     actor, env = trained.deploy(_ROBOTS, SEED)
     with closing(env):
-        policy = make_deployable(actor, env)
-        rollout, extremes = roll_out(actor, env), extreme_states(policy, env)
-        work = States({key: rollout.get(key) for key in policy.in_keys})
-        states = States({key: torch.cat([work[key], extremes[key]]) for key in policy.in_keys})
-        tried = f"{len(work):,} states of its work, {len(extremes):,} extremes"
-        gate.check_against_env(policy, actor, env, rollout, states)
-        report("the artifact is the policy", f"{tried}: equal to the last bit")
-
-        scripted = script(policy)
-        content = save(scripted)
-        loaded = load_module(content, policy.in_keys)
-        expected = gate.answers(policy, policy, states)
-        for stage, found in (
-            ("TorchScript is not the artifact", gate.answers(scripted, policy, states)),
-            ("the loaded file is not the artifact", gate.answers(loaded, policy, states)),
-            ("a fresh process disagrees", gate.ask_fresh_process(content, policy, states)),
-        ):
-            gate.compare_answers(stage, found, expected, states)
-        report("TorchScript, also in a fresh process", "equal to the last bit")
-
-        converted = onnx.convert(policy, states) if "onnx" in formats else None
-        tolerance = gate.onnx_tolerance(policy, expected, states)
-        if converted is not None:
-            worst = gate.check_onnx(onnx.Runtime(converted), policy, expected, states, tolerance)
-            report("ONNX in ONNX Runtime", f"within {worst:.1e} {policy.outputs[0].unit}")
-
-        if policy.memory_size:
-            forms: dict[str, tuple[gate.Function, float]] = {"the artifact": (policy, 0.0), "the file": (loaded, 0.0)}
-            if converted is not None:
-                forms["ONNX Runtime"] = (onnx.Runtime(converted), tolerance)
-            worst = gate.check_recurrence(forms, gate.acting(actor, env), policy, work)
-            others = f", ONNX within {worst:.1e}" if converted is not None else ""
-            report("remembers as the policy does", f"over {len(work):,} steps: to the last bit{others}")
-
-        driven = gate.check_drive(content, policy, actor, env, episodes, SEED)
+        forms = agreeing_forms(actor, env, formats, report)
+        driven = gate.check_drive(forms.content, forms.policy, actor, env, episodes, SEED)
         report(f"drives {episodes:,} episodes", f"reaches {driven.success_rate:.1%} of the goals, as the policy does")
-
-        opinion = _second_opinion(content, policy, trained, report)
+        opinion = _second_opinion(forms.content, forms.policy, trained, report)
         if opinion is not None and trained.config.export.transfer == "require":
             opinion.require(driven)
-
         described = {
             **describe.describe_origin(git_commit()),
-            **describe.describe_robot(env.simulation, policy),
             "checkpoint": {"which": which, "frames": trained.frames},
             "evaluation": {
                 **driven.summary(),
@@ -111,23 +85,115 @@ def export_policy(
                 "transfer": opinion and opinion.summary(),
             },
             "config": trained.config.model_dump(mode="json"),
-            "golden": describe.golden_pairs(states, expected, GOLDEN_PAIRS),
-            "content_sha256": content_sha256(content),
         }
-        described["metadata_sha256"] = metadata_sha256(described)
-        text = json.dumps(described, allow_nan=False)
-        final = save(scripted, text)
-        metadata = _load_as_a_robot_would(final)
-        gate.check_metadata(metadata, env.simulation, policy, expected)
+        return write(run_dir, formats, forms, env.simulation, described)
+
+
+@dataclass(frozen=True)
+class Forms:
+    """A policy in forms that agree.
+
+    Attributes:
+        policy: The artifact.
+        scripted: It in TorchScript.
+        content: The file of that, without metadata.
+        onnx: The file for ONNX Runtime, without metadata; None where none was asked for.
+        tolerance: How far ONNX Runtime's commands may be from the artifact's, rad or rad/s.
+        states: What they were asked.
+        expected: What the artifact answers.
+    """
+
+    policy: DeployablePolicy
+    scripted: torch.jit.ScriptModule
+    content: bytes
+    onnx: bytes | None
+    tolerance: float
+    states: States
+    expected: gate.Answers
+
+
+def agreeing_forms(
+    actor: TensorDictModuleBase, env: TransformedRobotEnv, formats: Sequence[str], report: Callable[[str, str], None]
+) -> Forms:
+    """Turn a trained policy into all forms that were asked for, and let each answer the same states.
+
+    Raises:
+        GateError: If any two forms disagree.
+    """
+    policy = make_deployable(actor, env)
+    rollout, extremes = roll_out(actor, env), extreme_states(policy, env)
+    work = States({key: rollout.get(key) for key in policy.in_keys})
+    states = States({key: torch.cat([work[key], extremes[key]]) for key in policy.in_keys})
+    tried = f"{len(work):,} states of its work, {len(extremes):,} extremes"
+    gate.check_against_env(policy, actor, env, rollout, states)
+    report("the artifact is the policy", f"{tried}: equal to the last bit")
+
+    scripted = script(policy)
+    content = save(scripted)
+    loaded = load_module(content, policy.in_keys)
+    expected = gate.answers(policy, policy, states)
+    for stage, found in (
+        ("TorchScript is not the artifact", gate.answers(scripted, policy, states)),
+        ("the loaded file is not the artifact", gate.answers(loaded, policy, states)),
+        ("a fresh process disagrees", gate.ask_fresh_process(content, policy, states)),
+    ):
+        gate.compare_answers(stage, found, expected, states)
+    report("TorchScript, also in a fresh process", "equal to the last bit")
+
+    converted = onnx.convert(policy, states) if "onnx" in formats else None
+    tolerance = gate.onnx_tolerance(policy, expected, states)
+    if converted is not None:
+        worst = gate.check_onnx(onnx.Runtime(converted), policy, expected, states, tolerance)
+        report("ONNX in ONNX Runtime", f"within {worst:.1e} {policy.outputs[0].unit}")
+
+    if policy.memory_size:
+        remembering: dict[str, tuple[gate.Function, float]] = {"the artifact": (policy, 0.0), "the file": (loaded, 0.0)}
         if converted is not None:
-            final_onnx = onnx.describe(converted, text)
-            gate.check_onnx(onnx.Runtime(final_onnx), policy, expected, states, tolerance)
-            if onnx.read_metadata(final_onnx) != text:
-                raise gate.GateError("the metadata of the ONNX file is not that of the policy")
-            write_atomically(run_dir / FILES["onnx"], final_onnx)
-        if "torchscript" in formats:
-            _publish(run_dir / FILES["torchscript"], final)
-        return metadata
+            remembering["ONNX Runtime"] = (onnx.Runtime(converted), tolerance)
+        worst = gate.check_recurrence(remembering, gate.acting(actor, env), policy, work)
+        others = f", ONNX within {worst:.1e}" if converted is not None else ""
+        report("remembers as the policy does", f"over {len(work):,} steps: to the last bit{others}")
+    return Forms(policy, scripted, content, converted, tolerance, states, expected)
+
+
+def write(
+    run_dir: Path, formats: Sequence[str], forms: Forms, simulation: Simulation, described: dict[str, Any]
+) -> Metadata:
+    """Write the files of forms that agree, once what they say about themselves is true.
+
+    Args:
+        run_dir: Where to.
+        formats: Keys of ``FILES``.
+        forms: From ``agreeing_forms``.
+        simulation: Robot and task.
+        described: What else the files say: where they are from, and how the policy drives.
+
+    Returns:
+        What the files say about themselves.
+
+    Raises:
+        GateError: If a file says what is not so; nothing is written.
+    """
+    described = {
+        **described,
+        **describe.describe_robot(simulation, forms.policy),
+        "golden": describe.golden_pairs(forms.states, forms.expected, GOLDEN_PAIRS),
+        "content_sha256": content_sha256(forms.content),
+    }
+    described["metadata_sha256"] = metadata_sha256(described)
+    text = json.dumps(described, allow_nan=False)
+    final = save(forms.scripted, text)
+    metadata = _load_as_a_robot_would(final)
+    gate.check_metadata(metadata, simulation, forms.policy, forms.expected)
+    if forms.onnx is not None and "onnx" in formats:
+        final_onnx = onnx.describe(forms.onnx, text)
+        gate.check_onnx(onnx.Runtime(final_onnx), forms.policy, forms.expected, forms.states, forms.tolerance)
+        if onnx.read_metadata(final_onnx) != text:
+            raise gate.GateError("the metadata of the ONNX file is not that of the policy")
+        write_atomically(run_dir / FILES["onnx"], final_onnx)
+    if "torchscript" in formats:
+        _publish(run_dir / FILES["torchscript"], final)
+    return metadata
 
 
 def _second_opinion(
@@ -138,7 +204,7 @@ def _second_opinion(
         opinion = transfer.ask(content, policy, trained, TRANSFER_EPISODES, SEED)
     except UserError as error:
         if trained.config.export.transfer == "require":
-            raise gate.GateError(f"export.transfer=require: {error}") from error
+            raise
         report("drives in the other engine", f"not asked: {error}")
         return None
     there = opinion.evaluation

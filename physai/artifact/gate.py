@@ -12,11 +12,12 @@ from typing import Any
 import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import TensorDictModule, TensorDictModuleBase
+from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from physai.artifact import fresh_process
+from physai.artifact.acting import as_actor
 from physai.artifact.describe import capsules
 from physai.artifact.module import VIEWS, DeployablePolicy, as_tuple
 from physai.artifact.states import States
@@ -324,12 +325,6 @@ def check_drive(
 
 def drive(content: bytes, policy: DeployablePolicy, env: TransformedRobotEnv, episodes: int, seed: int) -> Evaluation:
     """Evaluate a TorchScript file in the place of the actor: it sees what a robot senses, and what it remembers."""
-    module, joint_command = load_module(content, policy.in_keys), env.simulation.joint_command
-
-    def act(*inputs: Tensor) -> tuple[Tensor, ...]:
-        command, *memory = as_tuple(module(*inputs))
-        given = dict(zip(policy.in_keys, inputs, strict=True))
-        return joint_command.action(command, given.get(LAST_COMMAND, command)), *memory
-
-    actor = TensorDictModule(act, in_keys=policy.in_keys, out_keys=["action", *policy.out_keys[1:]])
+    module = load_module(content, policy.in_keys)
+    actor = as_actor(module, policy.in_keys, policy.out_keys, env.simulation.joint_command)
     return evaluate(actor, env, episodes, seed)

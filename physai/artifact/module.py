@@ -134,8 +134,9 @@ def make_deployable(actor: TensorDictModuleBase, env: TransformedRobotEnv) -> De
     """Put a trained actor and the env that it was trained in together.
 
     Raises:
-        UserError: If the policy sees what no robot can tell it.
+        UserError: If the policy sees what no robot can tell it, or the robot's base floats.
     """
+    env.simulation.spec.need_fixed_base("a policy file (export.formats) for")
     simulation, memory_size = env.simulation, getattr(actor, "memory_size", 0)
     keys = actor.seen_keys if memory_size else actor.in_keys
     for key in keys:

@@ -16,6 +16,7 @@ from physai.errors import UserError
 PARTS = {
     "policy": "one command of an exported policy, in every form that it has",
     "ros": "period and answers of the ROS 2 node, beside a bare one's",
+    "fleet": "eight virtual arms: how soon one message stops all of them, and how regularly they are driven",
     "gym": "the Gymnasium envs, against one written by hand and Stable-Baselines3's vector env",
     "startup": "how soon commands answer, how soon the first frame is there, and how long a thousand episodes take",
     "collection": "collection by one process and by two, against a bare PyBullet loop; and by each collector",
@@ -24,17 +25,22 @@ PARTS = {
     "training": "time to 99 percent of unseen goals, against the PPO of Stable-Baselines3, rsl_rl and SBX",
     "algorithms": "time to 95 percent of unseen goals of every algorithm, against Stable-Baselines3's of the same name",
     "arms": "time to 95 percent of a Panda's unseen goals, against PPO, and TQC with hindsight replay",
+    "identify": "what is found of hidden robots by their recordings, in the same engine and in another, and how soon",
+    "identified": "policies trained for a hidden robot as its recording shows it, against those for any, on the robot",
     "growth": "time and memory of training against frames and robots",
 }
 NEEDS = {  # the extra that a part needs, and its modules
     "policy": ("onnx", onnx.PACKAGES),
     "ros": ("ros", ["rclpy"]),
+    "fleet": ("ros", ["rclpy"]),
     "gym": ("bench", ["stable_baselines3"]),
     "training": ("bench,mujoco", ["stable_baselines3", "mujoco"]),
     "algorithms": ("bench", ["stable_baselines3"]),
     "arms": ("bench,mujoco", ["sb3_contrib", "panda_gym", "mujoco"]),
     "collection": ("ray", ["ray"]),
     "engines": ("mujoco", ["mujoco"]),
+    "identify": ("mujoco", ["mujoco"]),
+    "identified": ("mujoco", ["mujoco"]),
     "growth": ("bench", ["psutil"]),
 }
 

@@ -14,6 +14,7 @@ import sys
 import threading
 import traceback
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 
 import hydra
@@ -94,8 +95,9 @@ def guard() -> Iterator[None]:
     """
     # One that is ignored already stays so: that is what nohup asks for.
     heard = [number for number in _SIGNALS if signal.getsignal(number) is not signal.SIG_IGN]
+    stack = contextlib.ExitStack()
     try:
-        with handling(heard, lambda number, _: sys.exit(128 + number)):
+        with handling(heard, partial(_end, stack)), stack:
             yield
     except KeyboardInterrupt:
         sys.exit(130)
@@ -111,6 +113,20 @@ def guard() -> Iterator[None]:
             line = " ".join(line.split())
         print(f"error: {printable(line)}", file=sys.stderr)
         sys.exit(2)
+
+
+def _end(stack: contextlib.ExitStack, number: int, _: object) -> None:
+    """End this process for a signal; once more if it still runs a second later: what is imported may catch it."""
+    error = sys.exception()
+    while error is not None and not isinstance(error, SystemExit):
+        error = error.__context__
+    if error is not None:  # it is ending
+        return
+    again = threading.Timer(1.0, signal.pthread_kill, (threading.get_ident(), number))
+    again.daemon = True
+    again.start()
+    stack.callback(again.cancel)
+    sys.exit(128 + number)
 
 
 def _nobody_reads() -> bool:

@@ -13,27 +13,26 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
-from torch import multiprocessing
+from torch import multiprocessing, nn
 from torchrl.collectors import MultiCollector, _runner
 
 from physai.collectors.worker import MakeEnv, WorkerCollector, acting, each
 from physai.envs.make import TransformedRobotEnv
 from physai.errors import UserError
 from physai.processes import follow, signals_wait
-from physai.transforms.normalization import Normalizer
 
 
 class RobotMultiCollector(MultiCollector):
     """Several processes on this machine, each with robots of its own.
 
-    The policy and the normalizer with which a process acts lie in shared memory; the learner renews them between two
-    batches of that process, when it stands still: no lock is needed that a killed process could keep.
+    What a process acts with (:func:`acting`) lies in shared memory; the learner renews it between two batches of that
+    process, when it stands still: no lock is needed that a killed process could keep.
 
     Args:
         workers: Number of processes.
         make_env: See :data:`physai.collectors.worker.MakeEnv`.
         policy: What acts; its copies do.
-        normalizer: The learner's; its copies are used.
+        env: The learner's; copies of what it renews there are used.
         **torchrl: For TorchRL's collector.
     """
 
@@ -42,10 +41,10 @@ class RobotMultiCollector(MultiCollector):
         workers: int,
         make_env: MakeEnv,
         policy: TensorDictModuleBase,
-        normalizer: Normalizer,
+        env: TransformedRobotEnv,
         **torchrl: Any,
     ) -> None:
-        learner = acting(policy, normalizer)
+        learner = acting(policy, env)
         self._copies: list[Any] = [deepcopy(learner).cpu().share_memory() for _ in range(workers)]
         # The tensors themselves: load_state_dict would take half a millisecond of every batch.
         self._weights, *self._weights_of = (list(one.state_dict().values()) for one in (learner, *self._copies))
@@ -57,7 +56,7 @@ class RobotMultiCollector(MultiCollector):
             with signals_wait(), self._one_line():
                 super().__init__(
                     [
-                        partial(_start_worker, os.getpid(), make_env, copy["normalizer"], worker)
+                        partial(_start_worker, os.getpid(), make_env, copy, worker)
                         for worker, copy in enumerate(self._copies)
                     ],
                     policy_factory=[partial(_same, copy["policy"]) for copy in self._copies],
@@ -116,7 +115,7 @@ class RobotMultiCollector(MultiCollector):
             self.load_state_dict(state)
 
 
-def _start_worker(learner: int, make_env: MakeEnv, normalizer: Normalizer, worker: int) -> TransformedRobotEnv:
+def _start_worker(learner: int, make_env: MakeEnv, copy: nn.ModuleDict, worker: int) -> TransformedRobotEnv:
     follow(learner)
     if hasattr(os, "SCHED_BATCH"):  # Linux; whoever is woken does not take the processor from the one that wakes it
         with suppress(OSError):  # where that is not allowed, it is a little slower
@@ -125,7 +124,7 @@ def _start_worker(learner: int, make_env: MakeEnv, normalizer: Normalizer, worke
     # Without the wait two processes collect 4 to 9 % more.
     _runner._MIN_TIMEOUT = 0.0
     env = make_env(worker)
-    env.normalization.normalizer = normalizer
+    env.adopt(copy)
     return env
 
 

@@ -89,7 +89,7 @@ def make_collector(
         torch.manual_seed(derive(seed, "exploration", worker))
         return make_env(robots // processes, derive(seed, "train", worker))
 
-    parts = processes, make_worker_env, policy, env.normalizer
+    parts = processes, make_worker_env, policy, env
     if config.ray_init is not None:
         try:
             from physai.collectors.ray import RobotRayCollector  # it takes its time, and is there only if wanted

@@ -12,6 +12,9 @@ from pathlib import Path
 from typing import Any
 
 os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # Ray would report its use to its makers
+# Ray's processes would be nice (15) to all others, and the learner, which waits for them, with them: where two other
+# processes compute, they took five minutes to start.
+os.environ.setdefault("RAY_worker_niceness", "0")
 # Of a computer that is gone, Ray prints the last forty lines of its log; here, one line says so.
 os.environ.setdefault("RAY_DEDUP_LOGS_SKIP_REGEX", "^(Raylet is terminated|The node with node id)")
 
@@ -23,9 +26,9 @@ from torchrl.collectors.distributed import RayCollector
 
 from physai.collectors.worker import MakeEnv, WorkerCollector, acting, each
 from physai.config import nearest
+from physai.envs.make import TransformedRobotEnv
 from physai.errors import UserError
 from physai.processes import SIGNALS, handling, kill_with_this
-from physai.transforms.normalization import Normalizer
 
 _START_SECONDS = 60  # for a cluster that may be busy
 
@@ -41,7 +44,7 @@ class RobotRayCollector(RayCollector):
         workers: Number of processes; each takes one CPU.
         make_env: See :data:`physai.collectors.worker.MakeEnv`; Ray pickles it.
         policy: What acts; Ray pickles a copy of it.
-        normalizer: The learner's.
+        env: The learner's.
         ray_init: Arguments of ``ray.init``.
         **torchrl: For TorchRL's collector.
 
@@ -54,11 +57,11 @@ class RobotRayCollector(RayCollector):
         workers: int,
         make_env: MakeEnv,
         policy: TensorDictModuleBase,
-        normalizer: Normalizer,
+        env: TransformedRobotEnv,
         ray_init: dict[str, Any],
         **torchrl: Any,
     ) -> None:
-        self._learner = acting(policy, normalizer)
+        self._learner = acting(policy, env)
         self._ended = False
         self._watcher: subprocess.Popen[bytes] | None = None
         others = _descendants(os.getpid())
@@ -88,7 +91,8 @@ class RobotRayCollector(RayCollector):
             if started := _descendants(os.getpid()) - others:
                 self._watcher = kill_with_this(started)  # most notice by themselves, two take a minute
         except BaseException:
-            self._ended = True  # there is nothing more to shut down, and Ray would start anew to look
+            self._ended = True  # there is nothing more to shut down, and Ray would start anew to look:
+            getattr(self, "_remote_collectors", []).clear()  # TorchRL's __del__, too
             ray.shutdown()
             raise
 

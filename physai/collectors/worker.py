@@ -11,18 +11,17 @@ from torch import Tensor, nn
 
 from physai.collectors.single import RobotCollector
 from physai.envs.make import TransformedRobotEnv
-from physai.transforms.normalization import Normalizer
 
 MakeEnv = Callable[[int], TransformedRobotEnv]
 """Builds the env of a worker from its number, in the worker's process."""
 
 
-def acting(policy: TensorDictModuleBase, normalizer: Normalizer) -> nn.ModuleDict:
-    """Return what decides how robots act: a policy, and the normalizer of what it sees.
+def acting(policy: TensorDictModuleBase, env: TransformedRobotEnv) -> nn.ModuleDict:
+    """Return what decides how robots act, and which robots: a policy, and what a learner renews in an env.
 
     Each worker has a copy, which follows the learner's between two batches and never in the middle of one.
     """
-    return nn.ModuleDict({"policy": policy, "normalizer": normalizer})
+    return nn.ModuleDict({"policy": policy, **env.learned})
 
 
 def each(
@@ -48,7 +47,7 @@ class WorkerCollector(RobotCollector):
 
     def renew(self, weights: dict[str, Tensor]) -> None:
         """Act from now on as those do whose ``state_dict`` (:func:`acting`) this is."""
-        acting(self.policy, self.env.normalizer).load_state_dict(weights)
+        acting(self.policy, self.env).load_state_dict(weights)
 
     def state_dict(self) -> dict[str, Any]:
         """Return the state of the env and of this process' random numbers."""

@@ -9,12 +9,13 @@ from physai.deploy.goals import Goal
 from physai.deploy.joints import JointState
 from physai.deploy.metadata import Metadata, PolicyError
 from physai.deploy.parameters import ControllerConfig
-from physai.deploy.policy import Policy, load_policy, read_metadata
+from physai.deploy.policy import Driver, Policy, load_policy, read_metadata
 
 __all__ = [
     "Command",
     "Controller",
     "ControllerConfig",
+    "Driver",
     "Goal",
     "JointState",
     "Metadata",

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from physai.deploy.metadata import GOAL, LAST_COMMAND, MEMORY
-from physai.deploy.policy import Policy
+from physai.deploy.policy import Driver
 from physai.errors import UserError
 
 KNOWN = ("joint_position", "joint_velocity", GOAL, LAST_COMMAND, MEMORY)  # what a controller can tell a policy
@@ -35,7 +35,7 @@ class CheckedPolicy:
         UserError: If the policy takes an input that a controller cannot tell it.
     """
 
-    def __init__(self, policy: Policy, stopwatch: Callable[[], float]) -> None:
+    def __init__(self, policy: Driver, stopwatch: Callable[[], float]) -> None:
         metadata = policy.metadata
         self._policy, self._stopwatch = policy, stopwatch
         self._inputs = [signal.name for signal in metadata.inputs]

@@ -20,7 +20,7 @@ from physai.deploy.joints import Heard, JointReader, JointState, JointStateError
 from physai.deploy.limits import LATE, VelocityLimits, check
 from physai.deploy.metadata import GOAL, LAST_COMMAND, MEMORY
 from physai.deploy.parameters import ControllerConfig
-from physai.deploy.policy import Policy
+from physai.deploy.policy import Driver
 
 _STILL = 3  # updates in a row at the same time
 _STEP = 0.75  # periods; what is asked again sooner is the same step of a policy that remembers
@@ -38,7 +38,7 @@ class Controller:
     not drive.
 
     Args:
-        policy: From :func:`physai.deploy.load_policy`.
+        policy: From :func:`physai.deploy.load_policy`, or who else answers as one.
         config: Limits and timeouts.
         stopwatch: Measures how long the policy took, in s; no other decision depends on a clock.
 
@@ -48,7 +48,7 @@ class Controller:
 
     def __init__(
         self,
-        policy: Policy,
+        policy: Driver,
         config: ControllerConfig | None = None,
         stopwatch: Callable[[], float] = time.perf_counter,
     ) -> None:

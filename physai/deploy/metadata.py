@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from physai.collision import CollisionModel
+from physai.collision import CollisionModel, Motions
 from physai.errors import UserError
 from physai.signals import Quantity, Region, Signal, Tolerance
 from physai.signals.region import REGIONS
@@ -61,6 +61,8 @@ class Metadata:
         outputs: What it gives, in order; first the command.
         region: Where goals lie.
         tolerances: Errors that count as reached, one for each error that the policy tells.
+        kinematics: What each joint moves, and the end effector's frame in that of the last one, 4 x 4: for pictures.
+            None in files that do not tell.
         collision: The robot's capsules, and what it was trained not to touch; None where it has none.
         golden: Inputs, and the outputs and errors that the policy gave for them when it was exported, by name; float32,
             [pairs, ...].
@@ -80,6 +82,7 @@ class Metadata:
     outputs: tuple[Signal, ...]
     region: Region
     tolerances: tuple[Tolerance, ...]
+    kinematics: tuple[Motions, np.ndarray] | None
     collision: CollisionModel | None
     golden: dict[str, np.ndarray]
     content_sha256: str
@@ -127,14 +130,8 @@ class Metadata:
         inputs = tuple(_signal(raw, key) for key in _items(raw, "inputs", 32, "signals"))
         outputs = tuple(_signal(raw, key) for key in _items(raw, "outputs", 32, "signals"))
         _check_signals(inputs, outputs, tuple(joints))
-        tolerances = tuple(_tolerance(raw, key) for key in _items(raw, "goal.tolerances", 1000, "tolerances"))
-        region = _region(raw)
         goal = next(signal for signal in inputs if signal.name == GOAL)
-        most = float(np.abs(region.bounds).max())
-        if any(each.unit == goal.unit and each.value > most for each in tolerances):
-            raise PolicyError(f"metadata: goal.tolerances: one of more than {most:g} {goal.unit} is met everywhere")
-        if goal.shape != (size := len(region.bounds[0]),):
-            raise PolicyError(f"metadata: goal.region has {size} numbers, the goal has the shape {list(goal.shape)}")
+        region, tolerances = _asked(raw, goal)
         for key, kind in _FOR_PEOPLE.items():
             _get(raw, key, kind)
         pairs = len(_get(raw, f"golden.{outputs[0].name}", list))
@@ -156,6 +153,7 @@ class Metadata:
             outputs=outputs,
             region=region,
             tolerances=tolerances,
+            kinematics=_kinematics(raw, n),
             collision=_collision(raw, n),
             golden={key: _array(raw, f"golden.{key}", shape, kind=np.float32) for key, shape in shapes.items()},
             content_sha256=_get(raw, "content_sha256", str),
@@ -165,6 +163,26 @@ class Metadata:
         if _get(raw, "metadata_sha256", str) != metadata_sha256(raw):
             raise PolicyError("the metadata is not what was exported (metadata_sha256 differs)")
         return found
+
+
+def describe_goal(metadata: Metadata) -> str:
+    """Return JSON that tells what is asked of a robot, in the words of the policy's metadata."""
+    asked = {"region": describe_region(metadata.region), "tolerances": [vars(each) for each in metadata.tolerances]}
+    return json.dumps({"inputs": [describe_signal(metadata.goal)], "goal": asked})
+
+
+def read_goal(text: str) -> tuple[Signal, Region, tuple[Tolerance, ...]]:
+    """Return the goal, where goals lie, and what is near enough, of the JSON of :func:`describe_goal`.
+
+    Raises:
+        PolicyError: If a part is missing, of the wrong shape, or impossible; it says which.
+    """
+    try:
+        raw = json.loads(text, parse_constant=_refuse_constant)
+    except (ValueError, RecursionError) as error:
+        raise PolicyError(f"the goal's description is damaged ({str(error)[:80]})") from error
+    goal = _signal(raw, "inputs.0")
+    return goal, *_asked(raw, goal)
 
 
 def describe_signal(signal: Signal) -> dict[str, Any]:
@@ -272,6 +290,17 @@ def _check_signals(inputs: tuple[Signal, ...], outputs: tuple[Signal, ...], join
         raise PolicyError(f"metadata: there is '{MEMORY}' among the inputs, and no '{NEW_MEMORY}' among the outputs")
 
 
+def _asked(raw: dict[str, Any], goal: Signal) -> tuple[Region, tuple[Tolerance, ...]]:
+    tolerances = tuple(_tolerance(raw, key) for key in _items(raw, "goal.tolerances", 1000, "tolerances"))
+    region = _region(raw)
+    most = float(np.abs(region.bounds).max())
+    if any(each.unit == goal.unit and each.value > most for each in tolerances):
+        raise PolicyError(f"metadata: goal.tolerances: one of more than {most:g} {goal.unit} is met everywhere")
+    if goal.shape != (size := len(region.bounds[0]),):
+        raise PolicyError(f"metadata: goal.region has {size} numbers, the goal has the shape {list(goal.shape)}")
+    return region, tolerances
+
+
 def _region(raw: dict[str, Any]) -> Region:
     told = dict(_get(raw, "goal.region", dict))
     kind = told.pop("kind", None)
@@ -287,6 +316,14 @@ def _region(raw: dict[str, Any]) -> Region:
         return REGIONS[kind](**fields)
     except (TypeError, ValueError, OverflowError) as error:
         raise PolicyError(f"metadata: goal.region: {' '.join(str(error).split())[:120]}") from error
+
+
+def _kinematics(raw: dict[str, Any], joints: int) -> tuple[Motions, np.ndarray] | None:
+    if "kinematics" not in raw:
+        return None
+    keys = ("constant", "cosine", "sine")
+    moves = Motions(*(_array(raw, f"kinematics.{key}", (joints, 4, 4)) for key in keys))
+    return moves, _array(raw, "kinematics.tip", (4, 4))
 
 
 def _collision(raw: dict[str, Any], joints: int) -> CollisionModel | None:

@@ -6,7 +6,7 @@ import os
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 import torch
@@ -21,6 +21,19 @@ Vector = Sequence[float] | np.ndarray
 
 # Golden pairs are equal to the last bit where the processor is the one that recorded them; others round differently.
 GOLDEN_TOLERANCE = 1e-4  # in the unit of each signal
+
+
+class Driver(Protocol):
+    """What a controller asks for commands: a :class:`Policy`, or who else answers as one."""
+
+    metadata: Metadata
+    sha256: str
+
+    def __call__(self, *inputs: Vector) -> Any:
+        """See :class:`Policy`."""
+
+    def error(self, joint_position: Vector, goal: Vector) -> np.ndarray:
+        """See :class:`Policy`."""
 
 
 class Policy:

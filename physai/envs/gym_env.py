@@ -17,6 +17,7 @@ from physai.envs.simulation import EnvConfig, Simulation
 from physai.envs.viewing import has_screen, make_viewer, show
 
 if TYPE_CHECKING:
+    from physai.physics.following_viewer import FollowingViewer
     from physai.physics.stick_figure import StickFigure
     from physai.physics.viewer import Viewer
 
@@ -59,7 +60,7 @@ class RobotGymEnv(gymnasium.Env[Array, Array]):
             self.metadata["render_modes"] = ["rgb_array"]
         self.render_mode = render_mode
         self.observation_space, self.action_space = _spaces(self.simulation)
-        self._viewer: Viewer | StickFigure | None = None
+        self._viewer: Viewer | FollowingViewer | StickFigure | None = None
         self._seeded = False
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Array, dict[str, Any]]:
@@ -137,7 +138,7 @@ class RobotVectorEnv(VectorEnv[Array, Array, Array]):
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self._over = np.zeros(num_envs, bool)
-        self._viewer: Viewer | StickFigure | None = None
+        self._viewer: Viewer | FollowingViewer | StickFigure | None = None
         self._seeded = False
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Array, dict[str, Any]]:

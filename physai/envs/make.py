@@ -1,10 +1,11 @@
 """The one place where an environment and its transforms are put together."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from torch import Tensor
+from torch import Tensor, nn
 from torchrl.envs import TransformedEnv
 from torchrl.envs.transforms import Compose, Transform
 
@@ -16,10 +17,13 @@ from physai.physics import RandomizationConfig
 from physai.seeding import derive
 from physai.transforms import (
     DomainRandomization,
+    GrowingRandomization,
+    ImuModel,
     Memory,
     Normalizer,
     Observation,
     ObservationNormalization,
+    Ranges,
     SensorModel,
 )
 from physai.transforms.stochastic import StochasticTransform
@@ -49,6 +53,24 @@ class TransformedRobotEnv(TransformedEnv):
     def normalization(self) -> ObservationNormalization:
         """The transform that holds it."""
         return next(t for t in self.transform if isinstance(t, ObservationNormalization))
+
+    @property
+    def ranges(self) -> Ranges | None:
+        """From where to where robots are drawn now, where a curriculum lets that grow."""
+        return next((t.ranges for t in self.transform if isinstance(t, GrowingRandomization)), None)
+
+    @property
+    def learned(self) -> dict[str, nn.Module]:
+        """What a learner renews between two batches."""
+        ranges = self.ranges
+        return {"normalizer": self.normalizer} | ({} if ranges is None else {"ranges": ranges})
+
+    def adopt(self, learned: Any) -> None:
+        """Use, of what a learner renews, somebody else's."""
+        self.normalization.normalizer = learned["normalizer"]
+        for transform in self.transform:
+            if isinstance(transform, GrowingRandomization):
+                transform.ranges = learned["ranges"]
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         inner = tensordict
@@ -107,6 +129,7 @@ def make_env(
     num_envs: int,
     seed: int,
     memory_size: int = 0,
+    pinned: float | None = None,
 ) -> TransformedRobotEnv:
     """Put N robots, their randomization, sensors, observation and its normalization together.
 
@@ -117,14 +140,19 @@ def make_env(
         num_envs: N.
         seed: Seeds every source of randomness in the env.
         memory_size: How many numbers the policy remembers from step to step.
+        pinned: With a curriculum, the share of episodes on a boundary of its ranges, which begin narrow; None: without.
     """
     base = RobotEnv(env, num_envs)
     layout = base.simulation.layout
     transforms: list[Transform] = []
-    if randomization.draws:
+    if pinned is not None:
+        transforms.append(GrowingRandomization(Ranges(randomization, layout), pinned, layout, num_envs, 0))
+    elif randomization.draws:
         transforms.append(DomainRandomization(randomization, layout, num_envs, 0))
     if randomization.affects("encoder_offset", "position_noise", "velocity_noise"):
         transforms.append(SensorModel(layout, 0))
+    if base.simulation.spec.floating is not None and randomization.affects("gyro_noise", "gravity_noise"):
+        transforms.append(ImuModel(layout, 0))
     transforms.append(Observation(base.simulation.task.module))
     made = TransformedRobotEnv(base, Compose(*transforms))
     size = made.observation_spec["observation"].shape[-1]

@@ -8,7 +8,8 @@ from torchrl.envs import EnvBase
 
 from physai.envs.simulation import EnvConfig, Simulation
 
-_OBSERVED = ("physics_parameters", "success", "episode_length", "episode_rewards")
+_PRIVILEGED = ("physics_parameters", "relative_parameters", "past_actions")
+_OBSERVED = (*_PRIVILEGED, "success", "episode_length", "episode_rewards")
 
 
 class RobotEnv(EnvBase):
@@ -16,8 +17,9 @@ class RobotEnv(EnvBase):
 
     It speaks of what a robot senses and a task asks (:attr:`Simulation.sensed`) and leaves what a policy sees to the
     transforms. Beside them: ``physics_parameters`` (see :class:`physai.physics.ParameterLayout`; read at reset, when
-    given), ``success``, ``episode_length`` and ``episode_rewards`` (one column a term of the reward). Only the rows of
-    ``_reset`` are reset.
+    given), ``relative_parameters`` (the same for networks), ``past_actions``, ``success``,
+    ``episode_length`` and ``episode_rewards`` (one column a term of the reward); and of a base that floats
+    ``base_velocity`` (m/s, in its own frame), which no sensor tells. Only the rows of ``_reset`` are reset.
 
     Args:
         config: The environment.
@@ -35,7 +37,10 @@ class RobotEnv(EnvBase):
 
         self.observation_spec = Composite(
             **{signal.name: Unbounded(shape=(num_envs, *signal.shape)) for signal in self.simulation.sensed},
+            **{name: unbounded(value.shape[1]) for name, value in self.simulation.true_base().items()},
             physics_parameters=unbounded(len(self.simulation.layout.nominal)),
+            relative_parameters=unbounded(len(self.simulation.layout.nominal)),
+            past_actions=unbounded(self.simulation.past_actions.shape[1]),
             success=Binary(1, shape=(num_envs, 1), dtype=torch.bool),
             episode_length=unbounded(1, torch.int64),
             episode_rewards=unbounded(len(self.simulation.reward_terms)),
@@ -50,14 +55,9 @@ class RobotEnv(EnvBase):
 
     def _observe(self) -> dict[str, torch.Tensor]:
         simulation = self.simulation
-        seen = {
-            "joint_position": simulation.state.joint_position,
-            "joint_velocity": simulation.state.joint_velocity,
-            "goal": simulation.goal,
-            "last_command": simulation.last_command,
-        }
+        sensed, true = simulation.sense(), simulation.true_base()
         return {
-            **{signal.name: torch.from_numpy(seen[signal.name].astype(np.float32)) for signal in simulation.sensed},
+            **{name: torch.from_numpy(value.astype(np.float32)) for name, value in (sensed | true).items()},
             **{key: torch.from_numpy(getattr(simulation, key)) for key in _OBSERVED},
         }
 

@@ -10,23 +10,21 @@ import numpy as np
 from omegaconf import DictConfig
 from pydantic import Field
 from rich.console import Console
-from rich.markup import escape
 from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
-from rich.table import Table
 
 from physai import cli
 from physai.config import Config, Seed, validate
 from physai.envs.simulation import EnvConfig
 from physai.errors import UserError
 from physai.files import write_atomically
-from physai.identify.fit import Fit, Predictor, fit
+from physai.identify.fit import SPREAD, Fit, Predictor, fit
+from physai.identify.randomization import identified, text
 from physai.identify.recording import read
+from physai.identify.report import show, summary
 from physai.identify.trials import Trials, cut
 from physai.identify.unknowns import Unknowns
-from physai.physics import ParameterLayout
+from physai.physics import ParameterLayout, RandomizationConfig
 from physai.robots import RobotSpec
-
-_SHOWN = 0.2  # share of a direction below which a parameter is left out of its words
 
 
 class IdentifyConfig(Config):
@@ -40,6 +38,7 @@ class IdentifyConfig(Config):
     seed: Seed
     env: dict[str, Any]
     physics: dict[str, Any]
+    randomization: RandomizationConfig
 
     def robot(self) -> tuple[EnvConfig, RobotSpec, Unknowns]:
         """Return the env, its robot, and what is to be found; raises a UserError if there is none of these."""
@@ -47,6 +46,7 @@ class IdentifyConfig(Config):
         if not env.simulated:
             raise UserError("physics: only a simulated robot can be given other parameters")
         spec = RobotSpec.from_config(env.robot)
+        spec.need_fixed_base("identifying")
         return env, spec, Unknowns.of(self.fit, spec, ParameterLayout(spec))
 
     def trials(self, env: EnvConfig) -> Trials:
@@ -55,30 +55,37 @@ class IdentifyConfig(Config):
         return cut(read(Path(self.data), joints, env.control_dt, self.command_topic), self.data, joints)
 
     @property
-    def path(self) -> Path:
-        """Where the figures go."""
-        return Path(self.output or f"{self.data.rstrip('/')}.identified.json")
+    def folder(self) -> Path:
+        """Where the results go."""
+        data = Path(self.data)
+        return Path(self.output) if self.output else data.with_name(f"{data.stem}_identified")
 
 
 def _check(node: DictConfig) -> None:
     config = validate(IdentifyConfig, node)
-    if config.path.suffix != ".json":
-        raise UserError(f"output: '{config.output}' must end in .json")
-    env, _, _ = config.robot()
-    config.trials(env)
+    if config.folder.exists() and not config.folder.is_dir():
+        raise UserError(f"output: {config.folder} is no folder")
+    env, spec, _ = config.robot()
+    config.randomization.check(ParameterLayout(spec))
+    trials = config.trials(env)
+    if "effort_limit" in config.fit and not np.isfinite(trials.measured[2]).any():
+        raise UserError(
+            f"fit: effort_limit does not show in {config.data}, which has no efforts: with twice the masses, damping, "
+            "friction and effort a robot moves alike"
+        )
 
 
 def _identify(node: DictConfig, _: Path) -> None:
     config = validate(IdentifyConfig, node)
     env, spec, unknowns = config.robot()
     trials = config.trials(env)
-    console = Console()
+    console = Console(record=True)
     for reason in trials.left_out:
         console.print(f"left out: {reason}", highlight=False, markup=False)
     steps = int(np.isfinite(trials.measured[0]).all(axis=2).sum())
-    seconds = steps * env.control_dt
     console.print(
-        f"{len(trials)} motions, {seconds:.0f} s; {len(unknowns)} unknowns, delays of 0 to {config.delays} steps"
+        f"{len(trials)} motions, {steps * trials.period:.0f} s; {len(unknowns)} unknowns, delays of 0 to "
+        f"{config.delays} control steps"
     )
     columns = SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn()
     with (
@@ -86,80 +93,44 @@ def _identify(node: DictConfig, _: Path) -> None:
         closing(Predictor(spec, env.physics, env.control_dt, trials)) as predict,
     ):
         task = progress.add_task("fitting")
-        delays = range(config.delays + 1)
         found = fit(
-            predict, trials, unknowns, delays, config.seed, lambda what: progress.update(task, description=what)
+            predict, trials, unknowns, config.delays, config.seed, lambda what: progress.update(task, description=what)
         )
-    _show(console, found, spec, config.data)
-    summary = {
-        "data": config.data,
-        "env": env.name,
-        "physics": env.physics,
-        "seed": config.seed,
-        **_summary(found, spec),
-    }
-    write_atomically(config.path, json.dumps(summary, indent=2).encode())
-    console.print(f"Figures: {config.path}", highlight=False, markup=False)
-
-
-def _show(console: Console, found: Fit, spec: RobotSpec, data: str) -> None:
-    table = Table(title=escape(f"{data}: what '{spec.name}' is like"), title_justify="left")
-    table.add_column("parameter")
-    for column in ("described", "found", "95 % interval"):
-        table.add_column(column, justify="right")
-    nominal = found.unknowns.values(np.zeros((1, len(found.unknowns))))[0]
-    for number, label in enumerate(found.unknowns.labels):
-        low, high = found.interval[:, number]
-        cannot = "does not show" if found.unseen[number] else "cannot be told alone"
-        known = f"{found.values[number]:.4g}", f"{low:.4g} to {high:.4g}"
-        table.add_row(escape(label), f"{nominal[number]:.4g}", *(known if found.told[number] else ("", cannot)))
-    table.add_row("actuator_delay", "0", f"{found.delay}", "steps")
-    console.print(table)
-    for direction in found.together:
+    for number in found.spoilt:
         console.print(
-            f"Nothing in these motions tells {_words(direction, found)} apart.", highlight=False, markup=False
+            f"left out: at {trials.begins[number]:.2f} s: far from what other motions say; was something late?",
+            highlight=False,
         )
-    errors = Table(title="Motions held out: root mean square errors of predicted positions, mrad", title_justify="left")
-    for column in ("joint", "as described", "as found"):
-        errors.add_column(column, justify="left" if column == "joint" else "right")
-    for joint, before, after in zip(spec.joints, 1e3 * found.before, 1e3 * found.after, strict=True):
-        errors.add_row(escape(joint), f"{before:.2f}", f"{after:.2f}")
-    console.print(errors)
-    says = "the noise of the sensors explains them" if found.explained else (
-        "the model does not explain them: the robot has something that this engine or these parameters do not"
-    )  # fmt: skip
-    console.print(
-        f"Errors are {found.ratio:.2f} times the noise ({1e3 * found.noise:.2f} mrad): {says}.", highlight=False
+    show(console, found, spec, config.data)
+    _write(console, config, env, spec, found, trials.period)
+
+
+def _write(
+    console: Console, config: IdentifyConfig, env: EnvConfig, spec: RobotSpec, found: Fit, period: float
+) -> None:
+    """Write the figures, what to train with, the picture, and what was said."""
+    from physai.plots.identify import Identification, plot_identification
+
+    folder, layout = config.folder, ParameterLayout(spec)
+    folder.mkdir(parents=True, exist_ok=True)
+    figures = {"data": config.data, "env": env.name, "physics": env.physics, "seed": config.seed}
+    write_atomically(folder / "identified.json", json.dumps(figures | summary(found, spec), indent=2).encode())
+    about = (
+        f"'{spec.name}' as {config.data} shows it, found by physai.identify; train with it:",
+        f"python -m physai.train env={env.name} randomization={folder / 'identified.yaml'}",
     )
-
-
-def _words(direction: np.ndarray, found: Fit) -> str:
-    share = np.abs(direction) / np.abs(direction).max()
-    return " and ".join(label for label, each in zip(found.unknowns.labels, share, strict=True) if each > _SHOWN)
-
-
-def _summary(found: Fit, spec: RobotSpec) -> dict[str, Any]:
-    parameters = {
-        label: {
-            "value": float(found.values[number]),
-            "interval": found.interval[:, number].tolist(),
-            "told": bool(found.told[number]),
-            "shows": not found.unseen[number],
-        }
-        for number, label in enumerate(found.unknowns.labels)
-    }
-    return {
-        "parameters": parameters,
-        "actuator_delay": found.delay,
-        "cannot_be_told_apart": [_words(direction, found) for direction in found.together],
-        "held_out": {
-            joint: {"described": float(before), "found": float(after)}
-            for joint, before, after in zip(spec.joints, found.before, found.after, strict=True)
-        },
-        "noise": found.noise,
-        "ratio": found.ratio,
-        "explained": found.explained,
-    }
+    draws = identified(found, layout, config.randomization)
+    write_atomically(folder / "identified.yaml", text(draws, layout, about).encode())
+    unknowns = found.unknowns
+    title = f"'{spec.name}' from {config.data}: errors are {found.ratio:.2f} times the noise"
+    shown = Identification(
+        title, period, spec.joints, found.held_out, found.before, found.after, unknowns.labels, found.values,
+        found.coordinates, SPREAD * found.deviation, found.told,
+    )  # fmt: skip
+    plot_identification(shown, folder / "identified.png")
+    console.print(f"Picture: {folder / 'identified.png'}", highlight=False, markup=False, soft_wrap=True)
+    console.print(f"Train with it: {about[1]}", highlight=False, markup=False, soft_wrap=True)
+    write_atomically(folder / "identified.txt", console.export_text().encode())
 
 
 if __name__ == "__main__":

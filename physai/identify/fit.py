@@ -1,5 +1,6 @@
 """Find the robot whose motions are those that were recorded."""
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -14,9 +15,16 @@ from physai.robots import RobotSpec
 from physai.targets import make
 
 _STEP = 1e-3  # units, over which slopes are taken
-_FIRST, _LAST = 6, 40  # evaluations from each start, and from the best two
+_FIRST, _MORE, _LAST = 6, 15, 40  # evaluations from each start, from the best, and from the last two
 _STARTS = 3
+_CLOSE = 2.0  # times the best cost, up to which the second best may yet become the best
+_DOUBT = 3.0  # times the errors of most motions, beyond which an error counts by its size, and not by its square
+_SPOILT = 3.0  # times the errors of most motions: one with more is left out,
+_MOST_SPOILT = 0.34  # of the motions; if there were more, it is the model
+_ROUNDS = 3
+_PART = 0.25  # of a step of the recording: how finely a delay is found
 _EVERY = 4  # of the motions, one is held out
+SHARE = 0.1  # of the largest in a direction, from which a parameter has a part in it
 _TOLD = 0.3  # units; a parameter of which less is known cannot be told
 _EXPLAINED = 1.5  # times the noise, up to which the errors of motions held out count as explained
 SPREAD = 1.96  # standard deviations of a 95 % interval
@@ -31,30 +39,37 @@ class Fit:
     Attributes:
         unknowns: What was looked for, F numbers.
         coordinates: What they are, [F].
-        delay: Of the actuators, control steps.
+        delay: Of the actuators, control steps, and parts of one.
         deviation: Standard deviations of the coordinates, [F]: sqrt of the diagonal of the inverse of JᵀJ + 1, where
             the 1 says that each is within some units of the description.
+        alone: Standard deviation of each, if all the others were known, [F].
         told: Which of them the data tell, [F].
         together: Directions of unit length in which the data tell nothing, though each of their parameters shows,
             [K, F].
         unseen: Which of them show in no motion at all, [F].
         before: Root mean square error of positions in motions held out, as the description predicts them, rad, [n].
         after: The same of the fit, [n].
-        noise: Of positions, rad.
+        held_out: Positions in the H motions held out: measured, as described, as found, rad,
+            [3, T, H, n]; NaN where nothing was measured.
+        sensor_noise: Standard deviations of positions, rad, and velocities, rad/s, [2].
         ratio: Root mean square of all errors held out, in units of the noise of the sensors.
+        spoilt: Numbers of the motions that were left out, for they do not fit the others.
     """
 
     unknowns: Unknowns
     coordinates: np.ndarray
-    delay: int
+    delay: float
     deviation: np.ndarray
+    alone: np.ndarray
     told: np.ndarray
     together: np.ndarray
     unseen: np.ndarray
     before: np.ndarray
     after: np.ndarray
-    noise: float
+    held_out: np.ndarray
+    sensor_noise: np.ndarray
     ratio: float
+    spoilt: tuple[int, ...]
 
     @property
     def explained(self) -> bool:
@@ -79,40 +94,47 @@ class Predictor:
     Args:
         spec: The robot.
         physics: The engine, as ``conf/physics`` names one.
-        control_dt: s.
+        control_dt: Of its env, s; the engine steps at the period of the recording.
         trials: What it did, B motions.
     """
 
     def __init__(self, spec: RobotSpec, physics: dict[str, Any], control_dt: float, trials: Trials) -> None:
-        self._spec, self._config, self._control_dt, self._trials = spec, physics, control_dt, trials
+        self._spec, self._config, self._trials = spec, physics, trials
+        self.per_control_step = control_dt / trials.period
         self._layout = ParameterLayout(spec)
+        self.effort_limit = self._layout.columns["effort_limit"]
         self._made: dict[int, Physics] = {}
 
-    def __call__(self, parameters: np.ndarray, delay: int, start: np.ndarray) -> np.ndarray:
-        """Map ``physics_parameters`` [R, P] to what encoders would have said, [R, 2, T, B, n].
+    def __call__(self, parameters: np.ndarray, delay: float, start: np.ndarray) -> np.ndarray:
+        """Map ``physics_parameters`` [R, P] to what sensors would have said, [R, 3, T, B, n].
 
         Args:
             parameters: Of R robots, each of which makes all the motions.
-            delay: Of their actuators, control steps.
+            delay: Of their actuators, steps of the recording; of a fraction, a step feels the mean of two commands.
             start: What the encoders say when the motions begin, rad, [R, B, n].
         """
         trials, rows = self._trials, len(parameters)
         robots, joints = rows * len(trials), trials.start.shape[1]
         if robots not in self._made:
             needs = ("reset", "step", "close")
-            made: Physics = make("physics", self._config, self._spec, robots, self._control_dt, needs=needs)
+            made: Physics = make("physics", self._config, self._spec, robots, trials.period, needs=needs)
             self._made[robots] = made
         physics = self._made[robots]
         each = np.repeat(parameters, len(trials), axis=0)
         offset = each[:, self._layout.columns["encoder_offset"]]
         true = start.reshape(robots, joints) - offset
-        physics.reset(np.arange(robots), RobotState(true, np.zeros_like(true)), self._layout.dynamics(each))
-        arrives = np.concatenate([np.repeat(trials.before[None], delay, axis=0), trials.command])
-        seen = np.empty((len(trials.command), 2, robots, joints))
+        physics.reset(
+            np.arange(robots), RobotState(true, np.zeros_like(true)), self._layout.dynamics(each, self.per_control_step)
+        )
+        given = np.concatenate([np.repeat(trials.before[None], math.ceil(delay), axis=0), trials.command])
+        late = math.ceil(delay) - delay  # of a step, in which the newer of two commands is in force
+        arrives = given if late == 0.0 else (1.0 - late) * given[:-1] + late * given[1:]
+        seen = np.empty((len(trials.command), 3, robots, joints))
         for step, now in enumerate(seen):
             state = physics.step(np.tile(arrives[step], (rows, 1)))
             now[0], now[1] = state.joint_position + offset, state.joint_velocity
-        return seen.reshape(len(seen), 2, rows, len(trials), joints).transpose(2, 1, 0, 3, 4)
+            now[2] = 0.0 if state.joint_effort is None else state.joint_effort
+        return seen.reshape(len(seen), 3, rows, len(trials), joints).transpose(2, 1, 0, 3, 4)
 
     def close(self) -> None:
         """Free the engines."""
@@ -120,39 +142,57 @@ class Predictor:
             physics.close()
 
 
-def fit(predict: Predictor, trials: Trials, unknowns: Unknowns, delays: range, seed: int, told: Told) -> Fit:
+def fit(predict: Predictor, trials: Trials, unknowns: Unknowns, longest: int, seed: int, told: Told) -> Fit:
     """Least squares from several starts, with each delay; bounded, by trust regions (scipy's ``least_squares``).
 
-    Slopes come from one rollout in which each unknown is changed in a robot of its own. Every fourth motion is held
-    out.
+    Errors far beyond those of most motions count less at first (Huber, 1964), and motions full of them are left out: a
+    computer that was too late has spoilt them. Slopes come from one rollout in which each unknown is changed in a robot
+    of its own. Every fourth motion is held out.
 
     Args:
         predict: Of the trials.
         trials: What the robot did.
         unknowns: What to find.
-        delays: Of the actuators, in control steps: all are tried.
+        longest: Delay of the actuators that is tried, in control steps: up to it all that are whole steps of the
+            recording, and fractions of a step about the best.
         seed: Draws starts.
         told: Is told what goes on.
     """
     problem = _Problem(predict, trials, unknowns)
+    delays = range(round(longest * predict.per_control_step) + 1)
     starts = np.zeros((_STARTS, len(unknowns) + trials.start.size))
-    starts[1:, : len(unknowns)] = 0.7 * np.random.default_rng(seed).standard_normal((_STARTS - 1, len(unknowns)))
-    found: list[tuple[OptimizeResult, int]] = []
+    starts[:, : len(unknowns)] = problem.as_strong_as_shown()
+    starts[1:, : len(unknowns)] += 0.7 * np.random.default_rng(seed).standard_normal((_STARTS - 1, len(unknowns)))
+    found: list[tuple[OptimizeResult, float]] = []
     for number, start in enumerate(starts, 1):
         # Which delay it is shows before anything else is known.
-        delay = min(delays, key=lambda delay: float(np.square(problem.errors(problem.inside(start), delay)).sum()))
+        delay = min(delays, key=lambda delay: float(np.abs(problem.errors(problem.inside(start), delay)).sum()))
         found.append(problem.solve(start, delay, _FIRST))
         told(f"start {number} of {len(starts)}: {found[-1][0].cost:.4g}")
-    best, at = min(found, key=lambda each: float(each[0].cost))
-    for delay in delays:
-        if delay != at:
+    best, at = min(found, key=_cost)
+    for _ in range(_ROUNDS):
+        problem.set_doubt(best, at)
+        found = []
+        for delay in delays:
             found.append(problem.solve(best.x, delay, _FIRST))
-            told(f"delay of {delay} steps: {found[-1][0].cost:.4g}")
-    finalists = sorted(found, key=lambda each: float(each[0].cost))[:2]
-    last = [problem.solve(result.x, delay, _LAST) for result, delay in finalists]
-    result, delay = min(last, key=lambda each: float(each[0].cost))
-    told(f"best: {result.cost:.4g}, delay of {delay} steps")
-    return problem.judge(result, delay)
+            told(f"delay of {delay / predict.per_control_step:g} steps: {found[-1][0].cost:.4g}")
+        result, at = min(found, key=_cost)
+        best, at = problem.solve(result.x, at, _MORE)
+        if not problem.leave_out(best, at):
+            break
+    others = [each for each in sorted(found, key=_cost)[:2] if each[1] != at and _cost(each) < _CLOSE * best.cost]
+    finalists = [(best, at), *others]
+    problem.trust()
+    best, at = min((problem.solve(result.x, delay, _LAST) for result, delay in finalists), key=_cost)
+    for way in (-_PART, _PART):
+        while at + way >= 0 and _cost(better := problem.solve(best.x, at + way, _FIRST)) < best.cost:
+            best, at = better
+            told(f"delay of {at / predict.per_control_step:g} steps: {best.cost:.4g}")
+    return problem.judge(best, at)
+
+
+def _cost(found: tuple[OptimizeResult, float]) -> float:
+    return float(found[0].cost)
 
 
 class _Problem:
@@ -168,30 +208,44 @@ class _Problem:
         held_out = np.arange(len(trials)) % every == every - 1
         measured = np.isfinite(trials.measured)
         self._fitted = measured & ~held_out[:, None]
-        self._held_out = measured & held_out[:, None]
-        self._noise = trials.noise[:, None, None, None]
+        self._held_out = measured[:2] & held_out[:, None]
+        self._noise = trials.noise[:, None, None, :]
+        self._kept = np.ones(len(trials), dtype=bool)
+        self._doubt = _DOUBT
         anywhere = np.full(trials.start.size, np.inf)
         self.low = np.concatenate([unknowns.low, -anywhere])
         self.high = np.concatenate([unknowns.high, anywhere])
+
+    def as_strong_as_shown(self) -> np.ndarray:
+        """Coordinates of a robot as described whose motors can do what they did, and no more, [F].
+
+        From a limit that no motor of the prediction reaches, no slope leads to the one that the robot's motors reached.
+        """
+        described = self._unknowns.parameters(np.zeros((1, len(self._unknowns))))[0]
+        effort = np.abs(self._trials.measured[2])
+        felt = np.isfinite(effort).any(axis=(0, 1))
+        limit = described[self._predict.effort_limit]  # a view
+        limit[felt] = np.nanmax(effort[:, :, felt], axis=(0, 1))
+        return self._unknowns.coordinates(described)
 
     def inside(self, coordinates: np.ndarray) -> np.ndarray:
         """Move them a little into their bounds, as scipy wants it."""
         margin = 1e-6
         return np.clip(coordinates, self.low + margin, self.high - margin)
 
-    def _all(self, coordinates: np.ndarray, delay: int) -> np.ndarray:
-        """Errors in units of the noise, [R, 2, T, B, n]."""
+    def _all(self, coordinates: np.ndarray, delay: float) -> np.ndarray:
+        """Errors in units of the noise, [R, 3, T, B, n]."""
         size, trials = len(self._unknowns), self._trials
         start = trials.start + trials.start_noise * coordinates[:, size:].reshape(-1, *trials.start.shape)
         seen = self._predict(self._unknowns.parameters(coordinates[:, :size]), delay, start)
         return (seen - trials.measured) / self._noise
 
-    def errors(self, coordinates: np.ndarray, delay: int) -> np.ndarray:
+    def errors(self, coordinates: np.ndarray, delay: float) -> np.ndarray:
         """Errors of the motions that are fitted; then how far all is from what was believed, which counts as little."""
         errors = self._all(coordinates[None], delay)[0]
         return np.concatenate([errors[self._fitted], coordinates])
 
-    def slopes(self, coordinates: np.ndarray, delay: int) -> np.ndarray:
+    def slopes(self, coordinates: np.ndarray, delay: float) -> np.ndarray:
         """Of these errors, [errors, F + B n].
 
         Where a joint begins is changed in all motions at once, for none feels what is changed in another.
@@ -211,28 +265,67 @@ class _Problem:
                 slopes[:, size + trial * joints + joint] = own[self._fitted]
         return np.concatenate([slopes, np.eye(len(coordinates))])
 
-    def solve(self, start: np.ndarray, delay: int, evaluations: int) -> tuple[OptimizeResult, int]:
+    def _of_motions(self, result: OptimizeResult, delay: float) -> np.ndarray:
+        """Root mean square errors of all motions, in units of the noise, [B]."""
+        errors = np.where(np.isfinite(self._trials.measured[:2]), self._all(result.x[None], delay)[0, :2], np.nan)
+        motions: np.ndarray = np.sqrt(np.nanmean(np.square(errors), axis=(0, 1, 3)))
+        return motions
+
+    def set_doubt(self, result: OptimizeResult, delay: float) -> None:
+        """Say beyond which errors something other than noise and this model is at work, from those of most motions."""
+        self._doubt = _DOUBT * max(1.0, float(np.median(self._of_motions(result, delay)[self._kept])))
+
+    def trust(self) -> None:
+        """Let all errors count by their squares from now on."""
+        self._doubt = np.inf
+
+    def leave_out(self, result: OptimizeResult, delay: float) -> bool:
+        """Leave out motions whose errors are far beyond those of most; return whether there are any, and not many."""
+        errors = self._of_motions(result, delay)
+        kept = self._kept & (errors < _SPOILT * max(1.0, float(np.median(errors[self._kept]))))
+        if kept.all() or (kept == self._kept).all() or (~kept).sum() > _MOST_SPOILT * len(kept):
+            return False
+        self._kept = kept
+        self._fitted &= kept[:, None]
+        self._held_out &= kept[:, None]
+        return bool(self._fitted.any() and self._held_out.any())
+
+    def solve(self, start: np.ndarray, delay: float, evaluations: int) -> tuple[OptimizeResult, float]:
         """Go downhill from somewhere, with a given delay."""
         options: dict[str, Any] = {"bounds": (self.low, self.high), "x_scale": "jac", "max_nfev": evaluations}
+        if np.isfinite(self._doubt):
+            options |= {"loss": "huber", "f_scale": self._doubt}
         return least_squares(self.errors, self.inside(start), self.slopes, args=(delay,), **options), delay
 
-    def judge(self, result: OptimizeResult, delay: int) -> Fit:
+    def judge(self, result: OptimizeResult, delay: float) -> Fit:
         """Say what is known by now."""
         size = len(self._unknowns)
-        errors = self._all(np.stack([np.zeros_like(result.x), result.x]), delay)
-        ratio = float(np.sqrt(np.square(errors[1][self._held_out]).mean()))
-        squares = np.where(self._held_out, np.square(errors), np.nan)[:, 0]
+        described, found = (
+            self._all(at[None], late)[0, :2] for at, late in ((np.zeros_like(result.x), 0.0), (result.x, delay))
+        )
+        ratio = float(np.sqrt(np.square(found[self._held_out]).mean()))
+        squares = np.where(self._held_out, np.square(np.stack([described, found])), np.nan)[:, 0]
         before, after = self._trials.noise[0] * np.sqrt(np.nanmean(squares, axis=(1, 2)))
         slopes = self.slopes(result.x, delay)[: -len(result.x)] / max(ratio, 1.0)
         shows = np.square(slopes[:, :size]).sum(axis=0)
         covariance = np.linalg.inv(slopes.T @ slopes + np.eye(len(result.x)))[:size, :size]
         deviation = np.sqrt(np.diag(covariance))
+        alone = 1.0 / np.sqrt(np.diag(np.linalg.inv(covariance)))
         unseen = shows < 1.0 / _TOLD**2
         # Along these directions a change of some units is lost in the noise.
         values, directions = np.linalg.eigh(covariance[~unseen][:, ~unseen])
         together = np.zeros((int((values > _TOLD**2).sum()), size))
         together[:, ~unseen] = directions[:, values > _TOLD**2].T
+        shares = np.abs(together) > SHARE * np.abs(together).max(axis=1, keepdims=True)
+        told = (deviation < _TOLD) & ~shares.any(axis=0)
         return Fit(
-            self._unknowns, result.x[:size], delay, deviation, deviation < _TOLD, together, unseen, before, after,
-            float(self._trials.noise[0]), ratio,
+            self._unknowns, result.x[:size], delay / self._predict.per_control_step, deviation, alone, told,
+            together, unseen, before, after, self._motions(described, found), self._trials.noise[:2, 0], ratio,
+            tuple(np.flatnonzero(~self._kept).tolist()),
         )  # fmt: skip
+
+    def _motions(self, *errors: np.ndarray) -> np.ndarray:
+        """Positions in the motions held out, as measured and as predicted with these errors [2, T, B, n]."""
+        measured, kept = self._trials.measured[0], self._held_out[0].any(axis=(0, 2))
+        predicted = [each[0] * self._trials.noise[0] + measured for each in errors]
+        return np.stack([measured, *predicted])[:, :, kept]

@@ -1,5 +1,6 @@
 """What a robot was told and what its sensors said, read from a table or a recording of ROS topics."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,24 +13,28 @@ from physai.config import nearest
 from physai.errors import UserError
 
 _BACKWARDS, _FORWARDS = 1e-4, 600.0  # s; a clock that goes back or on by more at once has been set
+_MOST_PARTS = 4  # of a control period; finer steps cost much and tell little
+_SAME = 0.02  # within which a period is meant to be an equal part of a control period
 _WHAT = ("position", "velocity", "command")
 
 
 @dataclass(frozen=True)
 class Recording:
-    """What happened in each of T control steps; NaN where nothing arrived.
+    """What happened in each of T steps; NaN where nothing arrived.
 
     Attributes:
-        control_dt: From step to step, s.
+        period: From step to step, s: a control period, or an equal part of one.
         position: What the encoders said at the beginning of each step, rad, [T, n].
         velocity: rad/s, [T, n].
         command: In force from each step to the next, rad/s or rad, [T, n].
+        effort: What torque sensors said, N·m, [T, n]; all NaN of a robot without them.
     """
 
-    control_dt: float
+    period: float
     position: np.ndarray
     velocity: np.ndarray
     command: np.ndarray
+    effort: np.ndarray
 
     def __len__(self) -> int:
         return len(self.command)
@@ -39,7 +44,7 @@ def read(path: Path, joints: Sequence[str], control_dt: float, command_topic: st
     """Read a CSV file with a header, or the folder of a recording (rosbag2).
 
     A table has the columns ``time``, s, and for each joint ``position[<joint>]``, ``velocity[<joint>]`` and
-    ``command[<joint>]``; a row's command is in force from its time on.
+    ``command[<joint>]``; a row's command is in force from its time on. It may have ``effort[<joint>]``, too.
 
     Args:
         path: File or folder.
@@ -56,28 +61,32 @@ def read(path: Path, joints: Sequence[str], control_dt: float, command_topic: st
         states, commands = _of_table(path, joints)
     for what, series in (("joint states", states), ("commands", commands)):
         _check(path, what, series)
-    return _on_grid(path, states, commands, len(joints), control_dt)
+    return _on_grid(path, states, commands, control_dt)
 
 
 def _of_table(path: Path, joints: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
-    """Return states [K, 1 + 2n] and commands [K, 1 + n], times first."""
+    """Return states [K, 1 + 3n] and commands [K, 1 + n], times first."""
     try:
         table = pd.read_csv(path, skipinitialspace=True)
     except (OSError, UnicodeDecodeError, ValueError) as error:
         reason = getattr(error, "strerror", None) or " ".join(str(error).split())
         raise UserError(f"{path}: {reason}") from error
     columns = {what: [f"{what}[{joint}]" for joint in joints] for what in _WHAT}
+    efforts = [f"effort[{joint}]" for joint in joints]
+    if any(name in table for name in efforts):
+        columns["effort"] = efforts
     for name in ("time", *(column for of in columns.values() for column in of)):
         if name not in table:
             raise UserError(f"{path}: it has no column '{name}'{nearest(name, map(str, table.columns))}")
         if len(table) and not pd.api.types.is_numeric_dtype(table[name]):
             raise UserError(f"{path}: column '{name}' holds something that is no number")
     states = table[["time", *columns["position"], *columns["velocity"]]].to_numpy(np.float64)
-    return states, table[["time", *columns["command"]]].to_numpy(np.float64)
+    felt = table[efforts].to_numpy(np.float64) if "effort" in columns else np.full((len(table), len(joints)), np.nan)
+    return np.hstack([states, felt]), table[["time", *columns["command"]]].to_numpy(np.float64)
 
 
 def _of_topics(folder: Path, joints: Sequence[str], command_topic: str) -> tuple[np.ndarray, np.ndarray]:
-    """Return states [K, 1 + 2n] and commands [M, 1 + n] as they came, times first."""
+    """Return states [K, 1 + 3n] and commands [M, 1 + n] as they came, times first."""
     try:
         from rosbags.highlevel import AnyReader, AnyReaderError
         from rosbags.typesys import Stores, get_typestore
@@ -85,10 +94,11 @@ def _of_topics(folder: Path, joints: Sequence[str], command_topic: str) -> tuple
         raise UserError("recordings need rosbags: pip install rosbags") from error
     states: list[list[float]] = []
     commands: list[list[float]] = []
+    state_topic = f"{command_topic.rsplit('/', 2)[0]}/joint_states"  # of the robot in the same namespace
     try:
         with AnyReader([folder], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as reader:
-            wanted = [each for each in reader.connections if each.topic in ("/joint_states", command_topic)]
-            for topic in ("/joint_states", command_topic):
+            wanted = [each for each in reader.connections if each.topic in (state_topic, command_topic)]
+            for topic in (state_topic, command_topic):
                 if topic not in (each.topic for each in wanted):
                     raise UserError(f"{folder}: it holds no {topic}")
             for connection, stamp, data in reader.messages(wanted):
@@ -102,11 +112,11 @@ def _of_topics(folder: Path, joints: Sequence[str], command_topic: str) -> tuple
     lengths = {len(row) - 1 for row in commands}
     if lengths != {len(joints)}:
         raise UserError(f"{folder}: commands are for {sorted(lengths)} joints, and the robot has {len(joints)}")
-    return np.array(states).reshape(-1, 1 + 2 * len(joints)), np.array(commands)
+    return np.array(states).reshape(-1, 1 + 3 * len(joints)), np.array(commands)
 
 
 def _state(folder: Path, message: Any, joints: Sequence[str]) -> list[float] | None:
-    """Positions and velocities of a JointState in the robot's order; None where another part of it publishes."""
+    """Positions, velocities, efforts of a JointState in the robot's order; None where another part of it publishes."""
     names = list(message.name)
     if not set(names) & set(joints):
         return None
@@ -117,7 +127,8 @@ def _state(folder: Path, message: Any, joints: Sequence[str]) -> list[float] | N
     values = [list(getattr(message, key)) for key in ("position", "velocity")]
     if any(len(each) != len(names) for each in values):
         raise UserError(f"{folder}: /joint_states tells no positions or no velocities")
-    return [each[place] for each in values for place in places]
+    effort = list(message.effort) if len(message.effort) == len(names) else [math.nan] * len(names)
+    return [each[place] for each in (*values, effort) for place in places]
 
 
 def _check(path: Path, what: str, series: np.ndarray) -> None:
@@ -133,30 +144,38 @@ def _check(path: Path, what: str, series: np.ndarray) -> None:
         raise UserError(f"{path}: the clock of its {what} goes {way} by {abs(by):.3g} s at number {at}")
 
 
-def _on_grid(path: Path, states: np.ndarray, commands: np.ndarray, joints: int, control_dt: float) -> Recording:
+def _on_grid(path: Path, states: np.ndarray, commands: np.ndarray, control_dt: float) -> Recording:
     """Put what came at its own times on the steps of the robot's controller.
 
     States are taken as those of the nearest step: a driver reads them at its own steady pace, and what jitters is when
-    they were sent. Several within a step leave the last one.
+    they were sent. Where they come often, several make one step.
     """
     time = states[:, 0]
     period = float(np.median(np.diff(time)))
-    if not 0.9 < period / control_dt < 1.1:
+    if not period < 1.1 * control_dt:
         raise UserError(
-            f"{path}: joint states come every {period * 1e3:.3g} ms, and the control period of the env is "
+            f"{path}: joint states come every {period * 1e3:.3g} ms, and the control period of the env is only "
             f"{control_dt * 1e3:.3g} ms: env.control_dt={period:.2g} makes them one"
         )
     # Step by step, for a median is not so exact that it could be counted on for minutes.
     step = np.concatenate([[0], np.cumsum(np.rint(np.diff(time) / period).astype(int))])
-    period = float((time[-1] - time[0]) / step[-1])
+    period = float((time[-1] - time[0]) / max(step[-1], 1))
+    joined = max(math.ceil(round(control_dt / period) / _MOST_PARTS), 1)
+    tables = commands.shape[0] == states.shape[0] and np.array_equal(commands[:, 0], time)
+    kept = step % joined == 0
+    states, time, step, period = states[kept], time[kept], step[kept] // joined, period * joined
     gridded = np.full((step[-1] + 1, states.shape[1] - 1), np.nan)
     gridded[step] = states[:, 1:]
     # What was in force until the next state: the last command before that. Without a next state, by the clock.
     until = time[0] + period * np.arange(1, len(gridded) + 1)
-    until[step[1:] - 1] = time[1:]
-    tables = commands.shape[0] == states.shape[0] and np.array_equal(commands[:, 0], time)
+    later = step > 0  # the first states may share a step
+    until[step[later] - 1] = time[later]
     last = np.searchsorted(commands[:, 0], until - (0.5 * period if tables else 0.0), side="left") - 1
     given = np.where((last >= 0)[:, None], commands[np.maximum(last, 0), 1:], np.nan)
     if tables:  # with a row its command is lost
         given[np.setdiff1d(np.arange(len(given)), step)] = np.nan
-    return Recording(period, gridded[:, :joints], gridded[:, joints:], given)
+    parts = control_dt / period
+    if abs(parts / max(round(parts), 1) - 1.0) < _SAME:
+        period = control_dt / max(round(parts), 1)
+    position, velocity, effort = np.split(gridded, 3, axis=1)
+    return Recording(period, position, velocity, given, effort)

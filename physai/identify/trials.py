@@ -17,6 +17,7 @@ _CREEPS = 4.0  # standard deviations of what noise does to a mean; and at least,
 _RESTING = np.array([2e-4, 2e-3])
 _FEWEST, _MOST = 2, 40  # motions: one to learn from, one to judge by; and more hardly tell more
 _LEAST_NOISE = np.array([1e-5, 1e-4])  # rad, rad/s; encoders resolve no more
+_LEAST_SHARE = 0.01  # of the largest effort, to which it is known: sensors of torque have errors of scale, too
 _LEAST_MOTION = 20.0  # times the noise of positions, that each joint must move in some trial
 
 
@@ -25,15 +26,19 @@ class Trials:
     """B motions of T steps at most; what was not measured, and the end of shorter ones, is NaN.
 
     Attributes:
+        period: From step to step, s.
+        begins: When the motions begin, s from the beginning of the recording, [B].
         start: Where the encoders said that the robot stood, rad, [B, n].
         before: The command until then, [B, n].
         command: In force from each step to the next, [T, B, n]; finite.
-        measured: Positions, rad, and velocities, rad/s, after each of these steps, [2, T, B, n].
-        noise: Standard deviations of both while the robot stood still, [2].
+        measured: Positions, rad, velocities, rad/s, and efforts, N·m, after each of these steps, [3, T, B, n].
+        noise: Standard deviations of these while the robot stood still, [3, n]; of efforts 1 % of the largest.
         start_noise: Standard deviation of ``start``, which is a mean of few, rad.
         left_out: Parts of the recording that could not be used, in words.
     """
 
+    period: float
+    begins: np.ndarray
     start: np.ndarray
     before: np.ndarray
     command: np.ndarray
@@ -68,24 +73,28 @@ def cut(recording: Recording, name: str, joints: Sequence[str]) -> Trials:
         motions = [motions[number] for number in np.linspace(0, len(motions) - 1, _MOST).round().astype(int)]
     degrees = sum(len(each.rest[0]) - 1 for each in motions)
     squares = np.sum([np.square(_about_mean(each.rest)).sum(axis=1).mean(axis=1) for each in motions], axis=0)
-    noise = np.maximum(np.sqrt(squares / degrees), _LEAST_NOISE)
+    noise = np.tile(np.maximum(np.sqrt(squares / degrees), _LEAST_NOISE)[:, None], len(joints))
     start = np.stack([each.rest[0].mean(axis=0) for each in motions])
 
     longest = max(each.last - each.first for each in motions)
     command = np.empty((longest, len(motions), len(joints)))
-    measured = np.full((2, longest, len(motions), len(joints)), np.nan)
+    measured = np.full((3, longest, len(motions), len(joints)), np.nan)
     for number, each in enumerate(motions):
         length = each.last - each.first
         command[:, number] = recording.command[each.last - 1]
         command[:length, number] = recording.command[each.first : each.last]
-        measured[:, :length, number] = _measured(recording)[:, each.first + 1 : each.last + 1]
+        measured[:2, :length, number] = _measured(recording)[:, each.first + 1 : each.last + 1]
+        measured[2, :length, number] = recording.effort[each.first + 1 : each.last + 1]
     ways = np.nanmax(np.abs(measured[0] - start), axis=(0, 1))
     for joint, way in zip(joints, ways, strict=True):
-        if not way > _LEAST_MOTION * noise[0]:
+        if not way > _LEAST_MOTION * noise[0, 0]:
             raise UserError(f"{name}: '{joint}' moves by {way:.2g} rad at most: too little to tell anything of it")
+    begins = recording.period * np.array([each.first for each in motions])
     before = recording.command[[each.first - 1 for each in motions]]
-    start_noise = float(noise[0] / np.sqrt(np.mean([len(each.rest[0]) for each in motions])))
-    return Trials(start, before, command, measured, noise, start_noise, tuple(left_out))
+    largest = np.nanmax(np.nan_to_num(np.abs(recording.effort)), axis=0)
+    noise = np.concatenate([noise, [np.maximum(_LEAST_SHARE * largest, 1e-9)]])
+    start_noise = float(noise[0, 0] / np.sqrt(np.mean([len(each.rest[0]) for each in motions])))
+    return Trials(recording.period, begins, start, before, command, measured, noise, start_noise, tuple(left_out))
 
 
 @dataclass(frozen=True)
@@ -102,17 +111,17 @@ def _motions(recording: Recording) -> tuple[list[_Motion], list[str]]:
     changed[1:] = ~(known[1:] & known[:-1]) | (recording.command[1:] != recording.command[:-1]).any(axis=1)
     changes = np.flatnonzero(changed)
     still, mean, longest, shortest = (
-        round(seconds / recording.control_dt) for seconds in (_STILL, _MEAN, _LONGEST, _SHORTEST)
+        round(seconds / recording.period) for seconds in (_STILL, _MEAN, _LONGEST, _SHORTEST)
     )
     begins = [int(step) for last, step in pairwise(changes) if step - last >= still and known[step]]
     motions, left_out = [], []
     for first, following in zip(begins, [*begins, len(recording) - 1][1:], strict=True):
-        at = f"at {first * recording.control_dt:.2f} s"
+        at = f"at {first * recording.period:.2f} s"
         last = min(following, first + longest)
         unknown = np.flatnonzero(~known[first:last])
         if len(unknown):
             last = first + int(unknown[0])
-            left_out.append(f"{at}: no command is known from {last * recording.control_dt:.2f} s on")
+            left_out.append(f"{at}: no command is known from {last * recording.period:.2f} s on")
         rest = _measured(recording)[:, first - mean + 1 : first + 1]
         rest = rest[:, np.isfinite(rest).all(axis=(0, 2))]
         if last - first < shortest:

@@ -37,15 +37,16 @@ class Unknowns:
         columns: Where they stand, [F].
         low: Smallest coordinates, [F].
         high: Largest, [F].
+        in_parts: Which are factors of the description, [F].
     """
 
     labels: tuple[str, ...]
     columns: np.ndarray
     low: np.ndarray
     high: np.ndarray
+    in_parts: np.ndarray
     _nominal: np.ndarray
     _unit: np.ndarray
-    _in_parts: np.ndarray
 
     @classmethod
     def of(cls, names: Sequence[str], spec: RobotSpec, layout: ParameterLayout) -> "Unknowns":
@@ -87,7 +88,7 @@ class Unknowns:
             rows = np.array(each) == name
             low[rows] = np.maximum(low[rows], (least - at[rows]) / scale[rows])
             high[rows] = np.minimum(high[rows], (most - at[rows]) / scale[rows])
-        return cls(tuple(labels), np.array(columns), low, high, nominal, scale, in_parts)
+        return cls(tuple(labels), np.array(columns), low, high, in_parts, nominal, scale)
 
     def __len__(self) -> int:
         return len(self.labels)
@@ -96,7 +97,7 @@ class Unknowns:
         """Map coordinates [R, F] to ``physics_parameters`` [R, P]."""
         rows = np.repeat(self._nominal[None], len(coordinates), axis=0)
         at, steps = self._nominal[self.columns], coordinates * self._unit
-        rows[:, self.columns] = np.where(self._in_parts, at * np.exp(np.where(self._in_parts, steps, 0.0)), at + steps)
+        rows[:, self.columns] = np.where(self.in_parts, at * np.exp(np.where(self.in_parts, steps, 0.0)), at + steps)
         return rows
 
     def values(self, coordinates: np.ndarray) -> np.ndarray:
@@ -107,5 +108,5 @@ class Unknowns:
         """Map ``physics_parameters`` [P] to coordinates [F]."""
         at, value = self._nominal[self.columns], parameters[self.columns]
         with np.errstate(divide="ignore", invalid="ignore"):
-            found: np.ndarray = np.where(self._in_parts, np.log(value / at), value - at) / self._unit
+            found: np.ndarray = np.where(self.in_parts, np.log(value / at), value - at) / self._unit
         return found

@@ -12,8 +12,8 @@ _EXACT = 1e-9  # rad/s, and a share of the impulses
 
 def motor_velocity(
     mass: np.ndarray, free: np.ndarray, target: np.ndarray, limit: np.ndarray, lower: np.ndarray, upper: np.ndarray
-) -> np.ndarray:
-    """Return the joint velocities after one substep, rad/s, [N, n].
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the joint velocities after one substep, rad/s, and the impulses of the motors, N·m·s, [N, n] each.
 
     Each motor gives its joint the impulse that brings it to its target, or as much as it can; each limit what it takes.
     All are solved together, exactly: PyBullet's own sweeps end before they agree where joints are hard to tell apart.
@@ -32,10 +32,11 @@ def motor_velocity(
     bound = np.isfinite(lower) | np.isfinite(upper) | (np.abs(impulse) > limit)
     rows = bound.any(axis=1).nonzero()[0]
     if not len(rows):
-        return target
+        return target, impulse
     velocity = target.copy()
     velocity[rows] = _solve(*(array[rows] for array in (mass, free, target, limit, lower, upper, impulse)))
-    return velocity
+    impulse[rows] = _product(mass[rows], velocity[rows] - free[rows])
+    return velocity, np.clip(impulse, -limit, limit)  # beyond that it is a joint's limit that pushes
 
 
 def limit_velocity(beyond: np.ndarray, dt: float) -> np.ndarray:

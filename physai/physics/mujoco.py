@@ -12,10 +12,12 @@ from physai.physics.interface import (
     AT_REST,
     DynamicsParameters,
     RobotState,
+    at_home,
     loaded_links,
     loaded_mass,
     nominal_dynamics,
 )
+from physai.physics.mujoco_floating import FloatingBodies, put_on_floor
 from physai.robots import RobotSpec, engine_urdf
 from physai.signals import Quantity
 
@@ -31,13 +33,13 @@ _STEPS_PER_TIME_CONSTANT = 7  # of a servo: with fewer, a joint at its effort li
 
 
 class MuJoCoPhysics:
-    """N robots with a fixed base, in free space under gravity.
+    """N robots under gravity: with a fixed base in free space, or with a floating base, each on a floor of its own.
 
     The interface is :class:`physai.physics.Physics`. Joints that the spec does not control are welded at zero, and
-    shapes are left out: nothing touches anything here, so the state of a robot is its joint positions and velocities.
+    shapes are left out but for the spheres with which a robot that stands on the floor touches it.
 
-    A motor drives each joint at a velocity; where the robot takes positions, a servo tells the motor how fast to go,
-    once a control period.
+    Joints that are springs (``servo`` of the robot) are solved as such, implicitly. Elsewhere a motor drives each joint
+    at a velocity; where the robot takes positions, a servo tells the motor how fast to go, once a control period.
 
     - ``impulse`` is PyBullet's motor and integration (:mod:`physai.physics.impulse`), so robots move as in
       :class:`physai.physics.pybullet.PyBulletPhysics`, friction included.
@@ -75,30 +77,36 @@ class MuJoCoPhysics:
     ) -> None:
         self.num_robots = num_robots
         self._spec = spec
-        if motor == "servo":
+        if motor == "servo" and spec.servo is None:
             substeps = max(substeps, math.ceil(_STEPS_PER_TIME_CONSTANT * control_dt / motor_time_constant))
         model = _make_model(spec, motor, armature, control_dt / substeps)
         self._batch = Batch(model, num_robots, threads)
-        self._position, self._velocity = self._batch.bind("qpos"), self._batch.bind("qvel")
+        joints = len(spec.joints)  # a base that floats comes before them
+        self._position, self._velocity = self._batch.bind("qpos")[:, -joints:], self._batch.bind("qvel")[:, -joints:]
+        self._base = FloatingBodies(spec.floating, self._batch) if spec.floating else None
         names, mass = loaded_links(spec), model.body_mass
         self._links = [model.body(name).id for name in names]
-        self._tip = model.body(spec.end_effector).id
+        self._tip = model.body(spec.carrier).id
         self._moving = [model.body(name).id for name in spec.moving_links]
         self._unit_inertia = model.body_inertia[self._links] / np.where(mass > 0, mass, 1.0)[self._links, None]
         self._mass, self._inertia = self._batch.expand("body_mass"), self._batch.expand("body_inertia")
         self._damping = self._batch.expand("dof_damping")
-        self._motor: _Impulse | _Servo = (
-            _Impulse(spec, self._batch, substeps)
-            if motor == "impulse"
-            else _Servo(self._batch, substeps, control_dt, motor_time_constant)
-        )
+        self._motor: _Impulse | _Servo | _Springs
+        if spec.servo is not None:
+            self._motor = _Springs(self._batch, substeps, joints)
+        elif motor == "impulse":
+            self._motor = _Impulse(spec, self._batch, substeps)
+        else:
+            self._motor = _Servo(self._batch, substeps, control_dt, motor_time_constant)
         self._parameters = {key: np.repeat(value, num_robots, axis=0) for key, value in nominal_dynamics(spec).items()}
-        home = RobotState(np.tile(spec.home, (num_robots, 1)), np.zeros((num_robots, len(spec.joints))))
-        self.reset(np.arange(num_robots), home, self._parameters)
+        self.reset(np.arange(num_robots), at_home(spec, num_robots), self._parameters)
 
     def reset(self, rows: np.ndarray, state: RobotState, parameters: DynamicsParameters | None = None) -> None:
         """See :meth:`physai.physics.Physics.reset`."""
         self._position[rows], self._velocity[rows] = state.joint_position, state.joint_velocity
+        self._motor.effort[rows] = 0.0
+        if self._base is not None:
+            self._base.reset(rows, state)
         if parameters is None or not len(rows):
             return
         for key, value in parameters.items():
@@ -106,7 +114,9 @@ class MuJoCoPhysics:
         mass = loaded_mass(self._spec, {key: value[rows] for key, value in self._parameters.items()})
         self._mass[rows[:, None], self._links] = mass
         self._inertia[rows[:, None], self._links] = mass[:, :, None] * self._unit_inertia
-        self._damping[rows] = self._parameters["joint_damping"][rows]
+        self._damping[rows, -len(self._spec.joints) :] = self._parameters["joint_damping"][rows]
+        if self._base is not None:
+            self._base.set(rows, {key: value[rows] for key, value in self._parameters.items()})
         self._batch.set_const(np.unique(rows))  # what MuJoCo derives from masses
         self._motor.set(rows, {key: value[rows] for key, value in self._parameters.items()})
 
@@ -115,20 +125,23 @@ class MuJoCoPhysics:
         expected = self._position.shape
         if command.shape != expected:
             raise ValueError(f"commands of shape {expected} are needed, got {command.shape}")
-        if self._spec.command is Quantity.JOINT_POSITION:
+        if self._spec.command is Quantity.JOINT_POSITION and self._spec.servo is None:
             fastest, to_go = self._spec.velocity_limit, command - self._position
             command = np.clip(self._spec.position_gain * to_go, -fastest, fastest)
         self._motor.step(command)
+        if self._base is not None:
+            self._base.update()
         return self.robot_state()
 
     def robot_state(self) -> RobotState:
         """See :meth:`physai.physics.Physics.robot_state`."""
-        return RobotState(self._position.copy(), self._velocity.copy())
+        state = RobotState(self._position.copy(), self._velocity.copy(), self._motor.effort.copy())
+        return state if self._base is None else self._base.added_to(state)
 
     def parameters(self) -> DynamicsParameters:
         """Masses and damping as MuJoCo holds them; the rest as the motors got it."""
         parameters = {key: value.copy() for key, value in self._parameters.items()}
-        parameters["joint_damping"] = self._damping.copy()
+        parameters["joint_damping"] = self._damping[:, -len(self._spec.joints) :].copy()
         mass = self._mass.copy()
         mass[:, self._tip] -= parameters["payload"][:, 0]
         parameters["link_mass"] = mass[:, self._moving]
@@ -137,12 +150,17 @@ class MuJoCoPhysics:
     def state(self) -> dict[str, np.ndarray]:
         """See :meth:`physai.physics.Physics.state`."""
         parameters = {key: value.copy() for key, value in self._parameters.items()}
-        return {"joint_position": self._position.copy(), "joint_velocity": self._velocity.copy(), **parameters}
+        joints = {"joint_position": self._position.copy(), "joint_velocity": self._velocity.copy()}
+        return {**joints, **parameters, **({} if self._base is None else self._base.state())}
 
     def set_state(self, state: dict[str, np.ndarray]) -> None:
         """See :meth:`physai.physics.Physics.set_state`."""
-        robots = RobotState(state["joint_position"], state["joint_velocity"])
+        robots = RobotState(
+            state["joint_position"], state["joint_velocity"], None, state.get("base_pose"), state.get("base_twist")
+        )
         self.reset(np.arange(self.num_robots), robots, {key: state[key] for key in self._parameters})
+        if self._base is not None:
+            self._base.set_state(state)
 
     def close(self) -> None:
         """Do nothing: what MuJoCo holds goes with this object."""
@@ -163,6 +181,7 @@ class _Impulse:
             self._places[row, columns] = self._places[columns, row] = np.arange(start, start + count)
         shape = self._position.shape
         self._speeding, self._braking, self._gain = np.zeros(shape), np.zeros(shape), np.zeros(shape)
+        self.effort = np.zeros(shape)
 
     def set(self, rows: np.ndarray, parameters: DynamicsParameters) -> None:
         dt = self._batch.model.opt.timestep
@@ -181,10 +200,11 @@ class _Impulse:
             free = np.clip(velocity + dt * self._acceleration, -FASTEST, FASTEST)
             target = free + self._gain * (command - free)
             low, high = limit_velocity(self._lower - position, dt), -limit_velocity(position - self._upper, dt)
-            velocity = motor_velocity(self._mass[:, self._places], free, target, effort, low, high)
+            velocity, impulse = motor_velocity(self._mass[:, self._places], free, target, effort, low, high)
             velocity = np.clip(velocity, -FASTEST, FASTEST)
             position += dt * velocity
             self._position[:], self._velocity[:] = position, velocity
+        self.effort = impulse / dt
 
 
 class _Servo:
@@ -197,6 +217,8 @@ class _Servo:
         self._mass = batch.bind("M")
         self._own = batch.model.M_rowadr + batch.model.M_rownnz - 1  # the diagonal of the mass matrix
         self._time_constant = np.zeros(batch.bind("qpos").shape)
+        self._given, self._resisted = batch.bind("qfrc_actuator"), batch.bind("qfrc_constraint")
+        self.effort = np.zeros(self._time_constant.shape)
 
     def set(self, rows: np.ndarray, parameters: DynamicsParameters) -> None:
         self._friction[rows] = parameters["joint_friction"]
@@ -210,25 +232,54 @@ class _Servo:
         self._gain[:, :, 0], self._bias[:, :, 2] = gain, -gain
         self._batch.ctrl = command
         self._batch.step(nstep=self._substeps)
+        self.effort = self._given + self._resisted
+
+
+class _Springs:
+    """Position actuators, each with the stiffness and damping of its joint."""
+
+    def __init__(self, batch: Batch, substeps: int, joints: int) -> None:
+        self._batch, self._substeps, self._joints = batch, substeps, joints
+        self._friction, self._effort = batch.expand("dof_frictionloss"), batch.expand("actuator_forcerange")
+        self._gain, self._bias = batch.expand("actuator_gainprm"), batch.expand("actuator_biasprm")
+        self._given = batch.bind("actuator_force")
+        self.effort = np.zeros((batch.nsim, joints))
+
+    def set(self, rows: np.ndarray, parameters: DynamicsParameters) -> None:
+        self._friction[rows, -self._joints :] = parameters["joint_friction"]
+        self._effort[rows, :, 0], self._effort[rows, :, 1] = -parameters["effort_limit"], parameters["effort_limit"]
+        self._gain[rows, :, 0], self._bias[rows, :, 1] = parameters["stiffness"], -parameters["stiffness"]
+        self._bias[rows, :, 2] = -parameters["servo_damping"]
+
+    def step(self, command: np.ndarray) -> None:
+        self._batch.ctrl = command
+        self._batch.step(nstep=self._substeps)
+        self.effort = self._given.copy()
 
 
 def _make_model(spec: RobotSpec, motor: str, armature: float, time_step: float) -> "mujoco.MjModel":
     try:
-        made = mujoco.MjSpec.from_string(engine_urdf(spec.bodies, spec.joints).decode())
+        spheres = spec.floating.spheres if spec.floating else ()
+        shapes = [(sphere.body, sphere.center, sphere.radius) for sphere in spheres]
+        made = mujoco.MjSpec.from_string(engine_urdf(spec.bodies, spec.joints, shapes).decode())
         made.compiler.fusestatic = False  # a link keeps its mass to itself
         for joint in made.joints:
             joint.actfrclimited = False  # the effort limit is the motor's, each robot's own
-            if motor == "servo":
+            if motor == "servo" and spec.servo is None:
                 joint.armature = armature
+            if motor == "servo" or spec.servo is not None:
                 actuator = made.add_actuator(name=joint.name, target=joint.name)
                 actuator.trntype, actuator.biastype = mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtBias.mjBIAS_AFFINE
                 actuator.forcelimited, actuator.forcerange = True, [-1.0, 1.0]
+        if spec.floating is not None:
+            put_on_floor(made, spec.floating, spec.base)
         model = made.compile()
     except ValueError as error:
         raise UserError(f"{spec.urdf}: MuJoCo cannot load it: {' '.join(str(error).split())}") from error
     model.opt.timestep, model.opt.gravity = time_step, spec.gravity
     model.opt.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     off = mujoco.mjtDisableBit
-    # A warm start would be part of the state; friction and limits are in the impulses.
-    model.opt.disableflags |= off.mjDSBL_WARMSTART if motor == "servo" else off.mjDSBL_CONSTRAINT
+    if spec.servo is None:
+        # A warm start would be part of the state; friction and limits are in the impulses.
+        model.opt.disableflags |= off.mjDSBL_WARMSTART if motor == "servo" else off.mjDSBL_CONSTRAINT
     return model

@@ -14,14 +14,15 @@ from physai.physics.interface import (
     AT_REST,
     DynamicsParameters,
     RobotState,
+    at_home,
     loaded_links,
     loaded_mass,
     nominal_dynamics,
 )
+from physai.physics.pybullet_floating import FloatingBodies, Springs, put_on_floor
 from physai.robots import RobotSpec, engine_urdf
 from physai.signals import Quantity
 
-_FIXED_BASE = {"useFixedBase": True, "flags": bullet.URDF_USE_INERTIA_FROM_FILE}
 APART = 10.0  # m; each pair of robots that could touch costs time in each step, and few arms are longer than 5 m
 
 
@@ -41,12 +42,15 @@ class _World:
 
 
 class PyBulletPhysics:
-    """N robots with a fixed base, in free space under gravity.
+    """N robots under gravity: with a fixed base in free space, or with a floating base on a floor.
 
     The interface is :class:`physai.physics.Physics`. Joints that the spec does not control are welded at zero, and
-    shapes are left out: nothing touches anything here, so the state of a robot is its joint positions and velocities.
+    shapes are left out but for the spheres with which a robot that stands on the floor touches it. Robots never touch
+    each other. What PyBullet remembers of contacts is no part of the state: with a floating base, a restored robot goes
+    on as before, but not to the last bit.
 
-    Each joint is driven by PyBullet's velocity motor with a limited effort; where the robot takes positions, a servo
+    Joints that are springs (``servo`` of the robot) are given their effort once a substep. Elsewhere each joint
+    is driven by PyBullet's velocity motor with a limited effort; where the robot takes positions, a servo
     tells the motor how fast to go, once a control period. Coulomb friction has no counterpart in
     PyBullet's motors; it takes its share of the effort when the motor speeds a joint up, and helps when it brakes.
 
@@ -71,7 +75,9 @@ class PyBulletPhysics:
         try:
             with tempfile.TemporaryDirectory(prefix="physai-") as folder:
                 model = Path(folder) / "robot.urdf"
-                model.write_bytes(engine_urdf(spec.bodies, spec.joints))
+                spheres = spec.floating.spheres if spec.floating else ()
+                shapes = [(sphere.body, sphere.center, sphere.radius) for sphere in spheres]
+                model.write_bytes(engine_urdf(spec.bodies, spec.joints, shapes))
                 most = robots_per_world(spec)
                 for first in range(0, num_robots, most):
                     robots = min(most, num_robots - first)
@@ -85,13 +91,14 @@ class PyBulletPhysics:
         self._unit_inertia = masses
         self._row = [(world.client, body) for world in self._worlds for body in world.bodies]
         n = len(joints)
+        self._springs = Springs(self._row, joints) if spec.servo else None
+        self._base = FloatingBodies(spec.floating, self._row, loaded_links(spec), links) if spec.floating else None
         # Of all joints of all robots, in lists: what PyBullet takes and gives are single numbers.
-        self._position, self._velocity = [0.0] * (num_robots * n), [0.0] * (num_robots * n)
+        self._position, self._velocity, self._effort = ([0.0] * (num_robots * n) for _ in range(3))
         # Body, joint, effort to speed up and to brake with, gain.
         self._motors = [(body, joint, 0.0, 0.0, 0.0) for _, body in self._row for joint in joints]
         self._parameters = {key: np.repeat(value, num_robots, axis=0) for key, value in nominal_dynamics(spec).items()}
-        home = RobotState(np.tile(spec.home, (num_robots, 1)), np.zeros((num_robots, n)))
-        self.reset(np.arange(num_robots), home, self._parameters)
+        self.reset(np.arange(num_robots), at_home(spec, num_robots), self._parameters)
 
     def reset(self, rows: np.ndarray, state: RobotState, parameters: DynamicsParameters | None = None) -> None:
         """See :meth:`physai.physics.Physics.reset`."""
@@ -100,8 +107,11 @@ class PyBulletPhysics:
         for row, q, qd in zip(*columns, strict=True):
             client, body = self._row[row]
             self._position[row * n : (row + 1) * n], self._velocity[row * n : (row + 1) * n] = q, qd
+            self._effort[row * n : (row + 1) * n] = [0.0] * n
             for joint, position, velocity in zip(self._joints, q, qd, strict=True):
                 bullet.resetJointState(body, joint, position, velocity, client)
+        if self._base is not None:
+            self._base.reset(rows, state)
         if parameters is not None:
             self._set_parameters(rows, parameters)
 
@@ -122,6 +132,11 @@ class PyBulletPhysics:
                 )
             for joint, value in zip(self._joints, dampings, strict=True):
                 bullet.changeDynamics(body, joint, jointDamping=value, physicsClientId=client)
+        if self._base is not None:
+            self._base.set(rows, self._parameters["floor_friction"][rows])
+        if self._springs is not None:
+            self._springs.set(rows, {key: value[rows] for key, value in self._parameters.items()})
+            return
         limit, friction, gain = (
             self._parameters[key][rows] for key in ("effort_limit", "joint_friction", "velocity_gain")
         )
@@ -139,6 +154,11 @@ class PyBulletPhysics:
         expected = self.num_robots, len(self._joints)
         if command.shape != expected:
             raise ValueError(f"commands of shape {expected} are needed, got {command.shape}")
+        if self._springs is not None:
+            self._position, self._velocity, self._effort = self._springs.step(command, self.substeps)
+            if self._base is not None:
+                self._base.update()
+            return self.robot_state()
         if self._spec.command is Quantity.JOINT_POSITION:
             fastest, to_go = self._spec.velocity_limit, command - self.robot_state().joint_position
             command = np.clip(self._spec.position_gain * to_go, -fastest, fastest)
@@ -152,6 +172,7 @@ class PyBulletPhysics:
         mode, joints = bullet.VELOCITY_CONTROL, self._joints
         positions: list[float] = []
         velocities: list[float] = []
+        efforts: list[float] = []
         for world in self._worlds:
             client = world.client
             motors = islice(commands, len(world.bodies) * len(joints))
@@ -161,17 +182,19 @@ class PyBulletPhysics:
             for _ in range(self.substeps):
                 step(client)
             for body in world.bodies:
-                for position, velocity, _, _ in read(body, joints, client):
+                for position, velocity, _, effort in read(body, joints, client):
                     positions.append(position)
                     velocities.append(velocity)
-        self._position, self._velocity = positions, velocities
+                    efforts.append(effort)
+        self._position, self._velocity, self._effort = positions, velocities, efforts
 
     def robot_state(self) -> RobotState:
         """See :meth:`physai.physics.Physics.robot_state`."""
         shape = self.num_robots, len(self._joints)
-        return RobotState(
-            np.fromiter(self._position, float).reshape(shape), np.fromiter(self._velocity, float).reshape(shape)
+        state = RobotState(
+            *(np.fromiter(each, float).reshape(shape) for each in (self._position, self._velocity, self._effort))
         )
+        return state if self._base is None else self._base.added_to(state)
 
     def parameters(self) -> DynamicsParameters:
         """Masses and damping as PyBullet holds them; the rest as every step hands it to the motors."""
@@ -181,7 +204,7 @@ class PyBulletPhysics:
         for row, (client, body) in enumerate(self._row):
             masses = dict(zip(loaded_links(self._spec), self._links, strict=True))
             masses = {name: bullet.getDynamicsInfo(body, link, client)[0] for name, link in masses.items()}
-            masses[self._spec.end_effector] -= parameters["payload"][row, 0]
+            masses[self._spec.carrier] -= parameters["payload"][row, 0]
             parameters["link_mass"][row] = [masses[name] for name in self._spec.moving_links]
             parameters["joint_damping"][row] = [bullet.getJointInfo(body, joint, client)[6] for joint in self._joints]
         return parameters
@@ -192,13 +215,16 @@ class PyBulletPhysics:
         return {
             "joint_position": state.joint_position,
             "joint_velocity": state.joint_velocity,
+            **({} if self._base is None else {"base_pose": state.base_pose, "base_twist": state.base_twist}),
             **{key: value.copy() for key, value in self._parameters.items()},
         }
 
     def set_state(self, state: dict[str, np.ndarray]) -> None:
         """See :meth:`physai.physics.Physics.set_state`."""
         parameters = {key: state[key] for key in self._parameters}
-        robots = RobotState(state["joint_position"], state["joint_velocity"])
+        robots = RobotState(
+            state["joint_position"], state["joint_velocity"], None, state.get("base_pose"), state.get("base_twist")
+        )
         self.reset(np.arange(self.num_robots), robots, parameters)
 
     def close(self) -> None:
@@ -223,9 +249,10 @@ def _make_world(spec: RobotSpec, model: Path, robots: int, time_step: float) -> 
     bullet.setPhysicsEngineParameter(
         numSolverIterations=1000, solverResidualThreshold=1e-10, minimumSolverIslandSize=1, physicsClientId=client
     )
+    options = {"useFixedBase": spec.floating is None, "flags": bullet.URDF_USE_INERTIA_FROM_FILE}
     try:
         bodies = [
-            bullet.loadURDF(str(model), basePosition=(APART * robot, 0, 0), physicsClientId=client, **_FIXED_BASE)
+            bullet.loadURDF(str(model), basePosition=(APART * robot, 0, 0), physicsClientId=client, **options)
             for robot in range(robots)
         ]
     except bullet.error as error:
@@ -237,6 +264,8 @@ def _make_world(spec: RobotSpec, model: Path, robots: int, time_step: float) -> 
             bullet.changeDynamics(body, link, linearDamping=0, angularDamping=0, physicsClientId=client)
             # Even shapeless robots meet in the broadphase; solved in one island, they would feel each other's rounding.
             bullet.setCollisionFilterGroupMask(body, link, 0, 0, client)
+    if spec.floating is not None:
+        put_on_floor(client, bodies)
     return _World(client, bodies)
 
 
@@ -245,7 +274,7 @@ def _indices(world: _World, spec: RobotSpec) -> tuple[list[int], list[int], list
     body, client = world.bodies[0], world.client
     infos = [bullet.getJointInfo(body, joint, client) for joint in range(bullet.getNumJoints(body, client))]
     joints = {info[1].decode(): info[0] for info in infos}
-    links = {info[12].decode(): info[0] for info in infos}
+    links = {bullet.getBodyInfo(body, client)[0].decode(): -1} | {info[12].decode(): info[0] for info in infos}
     loaded = [links[name] for name in loaded_links(spec)]
     dynamics = [bullet.getDynamicsInfo(body, link, client) for link in loaded]
     unit_inertia = [tuple(moment / (info[0] or 1.0) for moment in info[2]) for info in dynamics]

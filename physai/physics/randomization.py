@@ -8,28 +8,38 @@ from pydantic import Field, model_validator
 from torch import Tensor
 
 from physai.config import Config, NonNegativeFloat, PositiveFloat
+from physai.errors import UserError
 from physai.physics.parameters import ParameterLayout
 
 Operation = Literal["scale", "add", "set"]
 
 
 class Uniform(Config):
-    """Uniform between ``low`` and ``high``."""
+    """Uniform between ``low`` and ``high``: the same for each column of a parameter, or lists of one value each."""
 
     distribution: Literal["uniform"]
-    low: float
-    high: float
+    low: float | Annotated[list[float], Field(min_length=1)]
+    high: float | Annotated[list[float], Field(min_length=1)]
     operation: Operation
 
     @model_validator(mode="after")
     def _ordered(self) -> "Uniform":
-        if self.low > self.high:
+        low, high = torch.tensor(self.low), torch.tensor(self.high)
+        if low.shape != high.shape:
+            raise ValueError(f": low {self.low} and high {self.high} must have as many values")
+        if (low > high).any():
             raise ValueError(f": low {self.low} is above high {self.high}")
         return self
 
+    @property
+    def columns(self) -> int | None:
+        """Of how many columns it speaks; None for any number."""
+        return len(self.low) if isinstance(self.low, list) else None
+
     def sample(self, draw: Tensor) -> Tensor:
         """Turn uniform numbers in [0, 1) into draws."""
-        return self.low + (self.high - self.low) * draw
+        low, high = torch.tensor(self.low, dtype=torch.float64), torch.tensor(self.high, dtype=torch.float64)
+        return low.float() + (high - low).float() * draw
 
 
 class LogUniform(Config):
@@ -67,11 +77,19 @@ class Normal(Config):
 Draw = Annotated[Uniform | LogUniform | Normal, Field(discriminator="distribution")]
 
 
-_LOWEST = {"link_mass": 1e-3, "velocity_gain": 1e-3, "encoder_offset": -math.inf}  # and zero for the others
+_LOWEST = {
+    "link_mass": 1e-3,
+    "velocity_gain": 1e-3,
+    "stiffness": 1e-3,
+    "encoder_offset": -math.inf,
+}  # and zero for the others
 
 
 class RandomizationConfig(Config):
-    """One file of ``conf/randomization``: what is drawn for each parameter, or null to leave it as it is."""
+    """One file of ``conf/randomization``: what is drawn for each parameter, or null to leave it as it is.
+
+    What a robot does not have, such as an arm on its pedestal a friction with the floor, is not drawn for it.
+    """
 
     name: str
     link_mass: Draw | None
@@ -80,10 +98,16 @@ class RandomizationConfig(Config):
     joint_friction: Draw | None
     effort_limit: Draw | None
     velocity_gain: Draw | None
+    stiffness: Draw | None
+    servo_damping: Draw | None
+    floor_friction: Draw | None
     actuator_delay: Draw | None
     encoder_offset: Draw | None
     position_noise: Draw | None
     velocity_noise: Draw | None
+    gyro_noise: Draw | None
+    gravity_noise: Draw | None
+    push: Draw | None
 
     @classmethod
     def none(cls) -> "RandomizationConfig":
@@ -92,8 +116,13 @@ class RandomizationConfig(Config):
 
     @property
     def draws(self) -> dict[str, Draw]:
-        """The parameters that are drawn."""
+        """The parameters that are drawn, of robots that have them."""
         return {name: draw for name, draw in self if name != "name" and draw is not None}
+
+    def of(self, layout: ParameterLayout) -> "RandomizationConfig":
+        """Return what is drawn of it for a robot."""
+        others = {name: None for name in self.draws if name not in layout.columns}
+        return self.model_copy(update=others) if others else self
 
     def affects(self, *names: str) -> bool:
         """Whether any of these parameters is drawn."""
@@ -103,9 +132,16 @@ class RandomizationConfig(Config):
         """Name the parameters whose draw changes nothing: a scale of what is zero in the robot's description."""
         return [
             name
-            for name, draw in self.draws.items()
+            for name, draw in self.of(layout).draws.items()
             if draw.operation == "scale" and not layout.nominal[layout.columns[name]].any()
         ]
+
+    def check(self, layout: ParameterLayout) -> None:
+        """Raise a UserError if a list has not one value for each column of its parameter."""
+        for name, draw in self.of(layout).draws.items():
+            needed = layout.labels[layout.columns[name]]
+            if isinstance(draw, Uniform) and draw.columns not in (None, len(needed)):
+                raise UserError(f"randomization.{name}: {draw.columns} values, and there are {', '.join(needed)}")
 
     def sample(self, rows: int, layout: ParameterLayout, generator: torch.Generator) -> Tensor:
         """Draw ``physics_parameters`` for so many robots, [rows, P], starting from the robot's nominal values.
@@ -113,9 +149,12 @@ class RandomizationConfig(Config):
         Every column of a parameter draws for itself: each joint has a friction of its own. Values that must not be
         negative are cut at zero (masses and gains just above), delays are rounded to whole control steps.
         """
-        draws = torch.rand(rows, len(layout.nominal), generator=generator)
-        parameters = layout.nominal.repeat(rows, 1)
-        for name, draw in self.draws.items():
+        return self.apply(torch.rand(rows, len(layout.nominal), generator=generator), layout)
+
+    def apply(self, draws: Tensor, layout: ParameterLayout) -> Tensor:
+        """Turn uniform numbers in [0, 1], one a column, into ``physics_parameters``, [rows, P]; see ``sample``."""
+        parameters = layout.nominal.repeat(len(draws), 1)
+        for name, draw in self.of(layout).draws.items():
             columns = layout.columns[name]
             value = draw.sample(draws[:, columns])
             if draw.operation == "scale":

@@ -1,5 +1,6 @@
 """Pictures of a robot and its goal, from a world of its own: looking never disturbs the simulation."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -105,24 +106,39 @@ class Viewer:
         bullet.resetBasePositionAndOrientation(self._frame, place, turn, self._client)
         if self._window:
             return None
-        width, height = self._size
-        image = bullet.getCameraImage(
-            width,
-            height,
-            self._view,
-            self._projection,
-            lightDirection=(0.6, -0.4, 2.0),
-            shadow=1,
-            lightAmbientCoeff=0.65,
-            lightDiffuseCoeff=0.45,
-            lightSpecularCoeff=0.05,
-            renderer=bullet.ER_TINY_RENDERER,
-            physicsClientId=self._client,
-        )[2]
-        return np.reshape(np.asarray(image, dtype=np.uint8), (height, width, 4))[..., :3].copy()
+        return picture(self._client, self._view, self._projection, self._size)
 
     def close(self) -> None:
         """Close the window and free the world; may be called twice."""
         if self._client >= 0:
             bullet.disconnect(self._client)
             self._client = -1
+
+
+def picture(client: int, view: Sequence[float], projection: Sequence[float], size: tuple[int, int]) -> np.ndarray:
+    """Render a world on the CPU.
+
+    Args:
+        client: PyBullet's number of the world.
+        view: Matrix of the camera's place, 16 numbers.
+        projection: Matrix of the camera's lens, 16 numbers.
+        size: Width and height, pixels.
+
+    Returns:
+        An image [height, width, 3] uint8.
+    """
+    width, height = size
+    image = bullet.getCameraImage(
+        width,
+        height,
+        view,
+        projection,
+        lightDirection=(0.6, -0.4, 2.0),
+        shadow=1,
+        lightAmbientCoeff=0.65,
+        lightDiffuseCoeff=0.45,
+        lightSpecularCoeff=0.05,
+        renderer=bullet.ER_TINY_RENDERER,
+        physicsClientId=client,
+    )[2]
+    return np.reshape(np.asarray(image, dtype=np.uint8), (height, width, 4))[..., :3].copy()

@@ -20,6 +20,7 @@ _UNITS = {
     "encoder_offset": "rad",
     "position_noise": "rad",
     "velocity_noise": "rad/s",
+    "push": "m/s",
     "motor_time_constant": "s",
 }
 _WORKS = 95  # %
@@ -40,9 +41,9 @@ def plot_maps(maps: "Mapping[str, Map]", output: Path) -> None:
         for axis, what in zip(row, ("success", "settled"), strict=True):
             mesh = _heat(axis, found, 100 * getattr(found, what) / found.episodes)
             axis.set_title(f"{Path(run).name}: {what}" if len(maps) > 1 else what.capitalize())
-        row[0].set_ylabel(_label(found.y.name, found.y.operation))
+        row[0].set_ylabel(label(found.y.name, found.y.operation))
     for axis in axes[-1]:
-        axis.set_xlabel(_label(found.x.name, found.x.operation))
+        axis.set_xlabel(label(found.x.name, found.x.operation))
     figure.colorbar(mesh, ax=axes, label="% of goals", shrink=0.9)
     handles = [
         Line2D([], [], color="black", linewidth=2, label="95 % work"),
@@ -71,6 +72,7 @@ def _heat(axis: Axes, found: "Map", percent: np.ndarray) -> QuadMesh:
     return mesh
 
 
-def _label(name: str, operation: str) -> str:
+def label(name: str, operation: str) -> str:
+    """A parameter and its unit, for people."""
     unit = "times what the robot's description says" if operation == "scale" else _UNITS.get(name, "")
     return f"{name.replace('_', ' ')}, {unit}".rstrip(", ")

@@ -1,7 +1,7 @@
 """Actor and critic networks: TensorDict modules around plain ``torch.nn``."""
 
 from physai.policies.networks import Critic, GaussianActor, ResidualActor, input_size
-from physai.policies.recurrent import GRUActor
+from physai.policies.recurrent import GRUActor, HistoryActor
 from physai.policies.squashed import DeterministicActor, TanhGaussianActor
 
 __all__ = [
@@ -9,6 +9,7 @@ __all__ = [
     "DeterministicActor",
     "GRUActor",
     "GaussianActor",
+    "HistoryActor",
     "ResidualActor",
     "TanhGaussianActor",
     "input_size",

@@ -139,16 +139,20 @@ class ResidualActor(GaussianActor):
         in_features: Numbers that ``in_keys`` bring.
         action_size: n.
         *args: Those of :class:`GaussianActor`, from ``in_keys`` on.
+        scale: How much of its output the network adds. Less than 1 for a good suggestion: the actor then learns more
+            slowly than the critic, whose learning rate is the same.
         **kwargs: The same by name.
     """
 
     residual = True
 
-    def __init__(self, in_features: int, action_size: int, *args: Any, **kwargs: Any) -> None:
+    def __init__(
+        self, in_features: int, action_size: int, *args: Any, scale: PositiveFloat = 1.0, **kwargs: Any
+    ) -> None:
         super().__init__(in_features, action_size, *args, **kwargs)
         if self.in_keys[-1] != "features":
             raise UserError("policy.actor.in_keys: the last must be features, which end with what the task suggests")
-        self.network = nn.Sequential(Residual(self.network, action_size))
+        self.network = nn.Sequential(Residual(self.network, action_size, scale))
 
 
 class Residual(nn.Module):
@@ -157,16 +161,18 @@ class Residual(nn.Module):
     Args:
         network: Maps [.., in_features] to [.., size].
         size: How many.
+        scale: Of what the network makes.
     """
 
-    def __init__(self, network: nn.Module, size: int) -> None:
+    def __init__(self, network: nn.Module, size: int, scale: float = 1.0) -> None:
         super().__init__()
         self.network = network
         self.size = size
+        self.scale = scale
 
     def forward(self, seen: Tensor) -> Tensor:
         """Map [.., in_features] to [.., size]."""
-        return self.network(seen) + seen[..., -self.size :]
+        return torch.add(seen[..., -self.size :], self.network(seen), alpha=self.scale)
 
 
 class Critic(TensorDictModuleBase):

@@ -2,6 +2,7 @@
 
 from physai.robots.bodies import engine_urdf
 from physai.robots.command import JointCommand
+from physai.robots.floating import FloatingBase
 from physai.robots.inverse import InverseKinematics
 from physai.robots.kinematics import (
     EndEffector,
@@ -14,6 +15,7 @@ from physai.robots.spec import RobotConfig, RobotSpec
 
 __all__ = [
     "EndEffector",
+    "FloatingBase",
     "ForwardKinematics",
     "InverseKinematics",
     "JointCommand",

@@ -1,7 +1,7 @@
 """The rigid bodies of a robot: links that nothing moves against each other are one, with the inertia of all of them."""
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -54,18 +54,24 @@ class Body:
 
 
 def merge(
-    path: Path, robot: Robot, driven: tuple[str, ...], tip: str, inertials: Mapping[str, InertialConfig]
+    path: Path,
+    robot: Robot,
+    driven: tuple[str, ...],
+    tip: str | None,
+    inertials: Mapping[str, InertialConfig],
+    floats: bool = False,
 ) -> tuple[Body, ...]:
     """Join the links of a robot that only ``driven`` joints move, from the base on; ``tip`` stays by itself.
 
-    An engine's step costs as many bodies as there are. The tip carries the payload, so it must be one.
+    An engine's step costs as many bodies as there are. A tip carries the payload, so it must be one.
 
     Args:
         path: Of the URDF, for errors.
         robot: Its links and joints.
         driven: Joints that move; the others are held at zero.
-        tip: The link at the end.
+        tip: The link at the end, if there is one.
         inertials: Of links whose inertia in the URDF is not to be believed.
+        floats: Whether the base moves, too, so that its inertia matters.
 
     Raises:
         UserError: If a link's inertia is none that a body can have, or ``inertials`` names no link; it says which.
@@ -86,15 +92,23 @@ def merge(
             placed[name], parts[name] = (joint, parent, here), []
             parent, here = name, np.eye(4)
         carriers[name] = parent, here
-        mass, com, inertia = _inertial(path, links[name], inertials.get(name), moves=bool(placed[parent][0]))
+        mass, com, inertia = _inertial(path, links[name], inertials.get(name), moves=floats or bool(placed[parent][0]))
         if mass:  # what weighs nothing resists nothing, whatever else its <inertial> says
             turn = here[:3, :3]
             parts[parent].append((mass, turn @ com + here[:3, 3], turn @ inertia @ turn.T))
     return tuple(Body(name, *placed[name], *_together(parts[name])) for name in placed)
 
 
-def engine_urdf(bodies: tuple[Body, ...], driven: tuple[str, ...]) -> bytes:
-    """Return the URDF that engines are given: bodies without shapes, of which only the ``driven`` joints move."""
+def engine_urdf(
+    bodies: tuple[Body, ...],
+    driven: tuple[str, ...],
+    spheres: Iterable[tuple[str, tuple[float, ...], float]] = (),
+) -> bytes:
+    """Return the URDF that engines are given: bodies, of which only the ``driven`` joints move.
+
+    Their only shapes are ``spheres``: the name of a body, the centre in its frame and the radius, m.
+    """
+    shapes = tuple(spheres)
     root = etree.Element("robot", name="robot")
     for body in bodies:
         link = etree.SubElement(root, "link", name=body.name)
@@ -103,6 +117,10 @@ def engine_urdf(bodies: tuple[Body, ...], driven: tuple[str, ...]) -> bytes:
         etree.SubElement(inertial, "mass", value=repr(float(body.mass)))
         (xx, xy, xz), (_, yy, yz), (_, _, zz) = ([repr(value) for value in row] for row in body.inertia.tolist())
         etree.SubElement(inertial, "inertia", ixx=xx, ixy=xy, ixz=xz, iyy=yy, iyz=yz, izz=zz)
+        for _, center, radius in (shape for shape in shapes if shape[0] == body.name):
+            collision = etree.SubElement(link, "collision")
+            etree.SubElement(collision, "origin", xyz=_text(np.array(center)), rpy="0 0 0")
+            etree.SubElement(etree.SubElement(collision, "geometry"), "sphere", radius=repr(radius))
         joint = body.joint
         if joint is None:
             continue

@@ -45,6 +45,26 @@ def motions(chain: Sequence[Joint], driven: Sequence[str]) -> tuple[Motions, np.
     return Motions(constant, cosine, sine), fixed
 
 
+def welded(joints: Sequence[Joint], base: str, bodies: Sequence[str]) -> dict[str, tuple[str, np.ndarray]]:
+    """Return what carries each link: of ``bodies``, the one that it is welded to, and its frame in that one's, 4 x 4.
+
+    Args:
+        joints: Of the whole robot; those that carry no body are held at zero.
+        base: The first link.
+        bodies: Names of the links that bodies begin with.
+    """
+    found = {base: (base, np.eye(4))}
+    links = [base]
+    for parent in links:  # grows while it is walked
+        body, frame = found[parent]
+        for joint in joints:
+            if joint.parent == parent:
+                own = joint.child in bodies
+                found[joint.child] = (joint.child, np.eye(4)) if own else (body, frame @ transform(joint.origin))
+                links.append(joint.child)
+    return found
+
+
 def carried(joints: Sequence[Joint], base: str, driven: Sequence[str]) -> dict[str, tuple[int, np.ndarray]]:
     """Return what carries each link.
 

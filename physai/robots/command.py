@@ -18,6 +18,9 @@ class JointCommand(nn.Module):
     a delay of the drive then slows nothing down. The command stays within ``LEAD`` of the joint, so that an arm that
     cannot follow does not run after it later, and within the position limits.
 
+    Where the robot says so (``action: offset``), an action is how far from home each joint shall be instead, as a share
+    of its ``command_limit``: what legs do is around a stance, and a policy that remembers nothing can tell where it is.
+
     Args:
         spec: The robot.
         control_dt: Control period, s.
@@ -25,7 +28,8 @@ class JointCommand(nn.Module):
 
     def __init__(self, spec: RobotSpec, control_dt: float) -> None:
         super().__init__()
-        self.moves_on = spec.command is Quantity.JOINT_POSITION
+        self.moves_on = spec.command is Quantity.JOINT_POSITION and not spec.offset
+        self.offset = spec.offset
         self.scale: Tensor
         self.lead: Tensor
         self.lower: Tensor
@@ -34,6 +38,9 @@ class JointCommand(nn.Module):
         self._arrays = limit * (control_dt if self.moves_on else 1.0), limit * LEAD, lower, upper
         for name, value in zip(("scale", "lead", "lower", "upper"), self._arrays, strict=True):
             self.register_buffer(name, torch.from_numpy(value).float())
+        self.home: Tensor
+        self._home = spec.home
+        self.register_buffer("home", torch.from_numpy(spec.home).float())
 
     def forward(self, action: Tensor, joint_position: Tensor, last_command: Tensor) -> Tensor:
         """Map actions, where joints are, rad, and their last commands, [N, n] each, to commands [N, n].
@@ -44,6 +51,8 @@ class JointCommand(nn.Module):
         if self.moves_on:
             near = torch.clamp(last_command + wanted, joint_position - self.lead, joint_position + self.lead)
             wanted = torch.clamp(near, self.lower, self.upper)
+        elif self.offset:
+            wanted = torch.clamp(self.home + wanted, self.lower, self.upper)
         return wanted
 
     def of_arrays(self, action: np.ndarray, joint_position: np.ndarray, last_command: np.ndarray) -> np.ndarray:
@@ -53,9 +62,12 @@ class JointCommand(nn.Module):
         if self.moves_on:
             near = np.clip(last_command + wanted, joint_position - lead, joint_position + lead)
             wanted = np.clip(near, lower, upper)
+        elif self.offset:
+            wanted = np.clip(self._home + wanted, lower, upper)
         return wanted
 
     @torch.jit.unused
     def action(self, command: Tensor, last_command: Tensor) -> Tensor:
         """Return the action that a command [N, n] comes from, where nothing held it back."""
-        return (command - last_command if self.moves_on else command) / self.scale
+        before = last_command if self.moves_on else self.home if self.offset else torch.zeros_like(command)
+        return (command - before) / self.scale

@@ -54,25 +54,34 @@ def find_mesh(path: Path, filename: str) -> Path:
     raise UserError(f"{path}: no mesh '{filename}' in its folder or in one above it")
 
 
+def geometry(where: str, shape: etree._Element) -> etree._Element:
+    """Return what a <collision> or a <visual> looks like: a mesh, box, sphere or cylinder.
+
+    Raises:
+        UserError: If it does not say.
+    """
+    found = shape.find("geometry")
+    children = [] if found is None else [child for child in found if isinstance(child.tag, str)]
+    if not children:
+        raise UserError(f"{where}: its <{shape.tag}> has no geometry")
+    return children[0]
+
+
 def _parts(path: Path, link: str, shape: etree._Element) -> list[np.ndarray]:
     where = f"{path}: link '{link}'"
-    geometry = shape.find("geometry")
-    children = [] if geometry is None else [child for child in geometry if isinstance(child.tag, str)]
-    if not children:
-        raise UserError(f"{where}: its <collision> has no geometry")
-    element = children[0]
+    element = geometry(where, shape)
     if element.tag == "mesh":
-        corners = [points * _numbers(where, element, "scale", 3, "1 1 1") for points in _mesh(path, where, element)]
+        corners = [points * numbers(where, element, "scale", 3, "1 1 1") for points in _mesh(path, where, element)]
     elif element.tag == "box":
-        corners = [0.5 * _numbers(where, element, "size", 3) * _CUBE]
+        corners = [0.5 * numbers(where, element, "size", 3) * _CUBE]
     elif element.tag == "sphere":
-        corners = [_numbers(where, element, "radius", 1) * _BALL]
+        corners = [numbers(where, element, "radius", 1) * _BALL]
     elif element.tag == "cylinder":
-        radius, length = (_numbers(where, element, key, 1) for key in ("radius", "length"))
+        radius, length = (numbers(where, element, key, 1) for key in ("radius", "length"))
         corners = [np.concatenate([radius, radius, 0.5 * length]) * _CAN]
     else:
         raise UserError(f"{where}: its <collision> is a <{element.tag}>, not a mesh, box, sphere or cylinder")
-    frame = transform(_origin(shape))
+    frame = transform(origin(shape))
     return [_hull(points) @ frame[:3, :3].T + frame[:3, 3] for points in corners]
 
 
@@ -101,7 +110,12 @@ def _hull(points: np.ndarray) -> np.ndarray:
         return np.unique(points, axis=0)
 
 
-def _numbers(where: str, element: etree._Element, key: str, count: int, absent: str = "") -> np.ndarray:
+def numbers(where: str, element: etree._Element, key: str, count: int, absent: str = "") -> np.ndarray:
+    """Read ``count`` numbers of an attribute: positive ones, but a scale may mirror.
+
+    Raises:
+        UserError: If it has others; the line begins with ``where``.
+    """
     text = element.get(key, absent)
     try:
         numbers = np.array(text.split(), dtype=np.float64)
@@ -117,11 +131,12 @@ def _numbers(where: str, element: etree._Element, key: str, count: int, absent: 
     return numbers
 
 
-def _origin(shape: etree._Element) -> Pose | None:
-    origin = shape.find("origin")
-    if origin is None:
+def origin(shape: etree._Element) -> Pose | None:
+    """Return where a shape is in the frame of its link; None: in the frame itself."""
+    element = shape.find("origin")
+    if element is None:
         return None
-    xyz, rpy = ([float(part) for part in origin.get(key, "0 0 0").split()] for key in ("xyz", "rpy"))
+    xyz, rpy = ([float(part) for part in element.get(key, "0 0 0").split()] for key in ("xyz", "rpy"))
     return Pose(xyz=xyz, rpy=rpy)
 
 

@@ -14,27 +14,33 @@ from physai.errors import UserError
 from physai.robots import bodies, collision, urdf
 from physai.robots.bodies import Body, InertialConfig
 from physai.robots.collision import CollisionConfig
+from physai.robots.floating import FloatingBase, FloatingConfig, Servo, ServoConfig
 from physai.signals import Quantity, Signal
 
 
 class RobotConfig(Config):
     """One file of ``conf/robot``.
 
-    ``command`` says what drives the joints, ``command_limit`` how fast an action of 1 moves each of them, rad/s, and
-    ``position_gain`` how fast a joint that takes positions closes in on them, 1/s. What follows stands in the place of
-    what the URDF says, or does not say: ``damping``, N·m·s/rad, and ``friction``, N·m, one value a joint, and
+    ``command`` says what drives the joints, and ``command_limit`` what an action of 1 means to each: with ``action:
+    speed`` how fast it moves, rad/s, with ``action: offset`` how far from home it goes, rad. Joints that take positions
+    either close in on them at ``position_gain``, 1/s, or are the springs of ``servo``. What follows stands in the place
+    of what the URDF says, or does not say: ``damping``, N·m·s/rad, and ``friction``, N·m, one value a joint, and
     ``inertials`` of links by name. ``gravity`` is in the base's frame, m/s²: it says how the base is mounted. Without
-    ``collision`` nobody asks whether the robot touches itself.
+    ``collision`` nobody asks whether the robot touches itself. ``floating`` is of a base that nothing holds; a robot
+    that has none needs an ``end_effector``.
     """
 
     name: str
     urdf: str
     joints: list[str] = Field(min_length=1)
-    end_effector: str
+    end_effector: str | None
     home: list[float]
     command: Literal["joint_velocity", "joint_position"]
+    action: Literal["speed", "offset"]
     command_limit: list[PositiveFloat]
     position_gain: PositiveFloat
+    servo: ServoConfig | None
+    floating: FloatingConfig | None
     damping: list[NonNegativeFloat] | None
     friction: list[NonNegativeFloat] | None
     gravity: list[float] = Field(min_length=3, max_length=3)
@@ -51,20 +57,23 @@ class RobotSpec:
         urdf: Path of the URDF file.
         joints: Names of the n controlled joints.
         base: Name of the link in whose frame positions are given.
-        end_effector: Name of the link that reaches.
+        end_effector: Name of the link that reaches; None where none does.
         home: Rest pose, rad, [n].
         position_limit: Lower and upper limit, rad, [n, 2]; infinite for continuous joints.
         velocity_limit: rad/s, [n].
         effort_limit: N·m, [n].
         command: What drives the joints: their velocities or their positions.
-        command_limit: How fast an action of 1 moves each joint, rad/s, [n].
+        offset: Whether an action is how far from home a joint shall be; else it is how fast it shall move.
+        command_limit: What an action of 1 means to each joint, rad/s, or rad from home, [n].
         position_gain: Of joints that take positions, 1/s: they want to move at this times the distance to go.
+        servo: Of joints that are driven as springs; None of others.
+        floating: What there is to know of a base that nothing holds; None of one that is fixed.
         damping: N·m·s/rad, [n].
         friction: Coulomb friction, N·m, [n].
         gravity: In the base's frame, m/s², [3].
-        chain: Joints from the base to the end effector, in order.
+        chain: Joints from the base to the end effector, in order; none without an end effector.
         bodies: What engines simulate, from the base on.
-        moving_links: Bodies with mass that the controlled joints move, by the name of their first link.
+        moving_links: Bodies with mass that move, by the name of their first link.
         link_mass: Their masses, kg.
         collision: The shapes of its links and which of them can meet; None where nobody has told.
         doubtful: What its description says that can hardly be true, in words.
@@ -74,14 +83,17 @@ class RobotSpec:
     urdf: Path
     joints: tuple[str, ...]
     base: str
-    end_effector: str
+    end_effector: str | None
     home: np.ndarray
     position_limit: np.ndarray
     velocity_limit: np.ndarray
     effort_limit: np.ndarray
     command: Quantity
+    offset: bool
     command_limit: np.ndarray
     position_gain: float
+    servo: Servo | None
+    floating: FloatingBase | None
     damping: np.ndarray
     friction: np.ndarray
     gravity: np.ndarray
@@ -91,6 +103,16 @@ class RobotSpec:
     link_mass: np.ndarray
     collision: CollisionModel | None
     doubtful: tuple[str, ...]
+
+    def need_fixed_base(self, what: str) -> None:
+        """Refuse by name what cannot be done with a robot whose base floats, with a UserError."""
+        if self.floating is not None:
+            raise UserError(f"the base of robot '{self.name}' floats: {what} such a robot is not possible yet")
+
+    @property
+    def carrier(self) -> str:
+        """Which link a payload is on: the end effector, or else the base."""
+        return self.end_effector or self.base
 
     @property
     def continuous(self) -> np.ndarray:
@@ -132,9 +154,13 @@ class RobotSpec:
         links = {link.name: link for link in robot.links}
         by_child = {joint.child: joint for joint in robot.joints}
 
-        if config.end_effector not in links:
-            raise UserError(f"{path}: no link '{config.end_effector}'{nearest(config.end_effector, links)}")
-        chain = _chain(path, config.end_effector, by_child)
+        tip = config.end_effector
+        if tip is None and config.floating is None:
+            raise UserError(f"robot '{config.name}': a robot whose base is fixed needs an end_effector")
+        if tip is not None and tip not in links:
+            raise UserError(f"{path}: no link '{tip}'{nearest(tip, links)}")
+        chain = _chain(path, tip, by_child) if tip else []
+        base = chain[0].parent if chain else next(name for name in links if name not in by_child)
         by_name = {joint.name: joint for joint in robot.joints}
         for name in config.joints:
             if name not in by_name:
@@ -142,9 +168,9 @@ class RobotSpec:
         for name in {name for name in config.joints if config.joints.count(name) > 1}:
             raise UserError(f"{path}: joint '{name}' is named twice in the robot's joints")
         on_chain = [joint.name for joint in chain if joint.name in config.joints]
-        if on_chain != list(config.joints):
+        if tip and on_chain != list(config.joints):
             raise UserError(
-                f"{path}: the joints must lie on the way from the base to '{config.end_effector}', in that order: "
+                f"{path}: the joints must lie on the way from the base to '{tip}', in that order: "
                 f"{on_chain}, not {list(config.joints)}"
             )
         joints = [by_name[name] for name in config.joints]
@@ -157,7 +183,7 @@ class RobotSpec:
             if len(values) != len(joints):
                 raise UserError(f"robot '{config.name}': {key} has {len(values)} values for {len(joints)} joints")
         for joint, speed in zip(joints, config.command_limit, strict=True):
-            if speed > joint.limit.velocity:
+            if config.action == "speed" and speed > joint.limit.velocity:
                 raise UserError(
                     f"robot '{config.name}': command_limit: {speed:g} rad/s is beyond the limit of '{joint.name}', "
                     f"{joint.limit.velocity:g} rad/s"
@@ -167,8 +193,19 @@ class RobotSpec:
         shapes = None
         if config.collision is not None:
             shapes = collision.model(path, robot, chain, driven, config.collision)
-        below = _links_below(config.joints[0], robot.joints, by_name)
-        together = bodies.merge(path, robot, driven, config.end_effector, config.inertials)
+        if config.action == "offset" and config.command != "joint_position":
+            raise UserError(f"robot '{config.name}': action: offset needs command: joint_position")
+        servo = floating = None
+        if config.servo is not None:
+            servo = Servo.from_config(config.servo, config.name, config.command, len(joints))
+        below = list(links)
+        if config.floating is None:
+            below = _links_below(config.joints[0], robot.joints, by_name)
+        together = bodies.merge(path, robot, driven, tip, config.inertials, floats=config.floating is not None)
+        if config.floating is not None:
+            floating = FloatingBase.from_config(config.floating, config.name, path, robot, base, together)
+            if servo is None:
+                raise UserError(f"robot '{config.name}': a floating base needs joints that are springs: give a servo")
         moving = [body for body in together if body.name in below and body.mass]
         for body in together:
             if body.joint is not None and body.joint.name in driven and not body.mass:
@@ -177,15 +214,18 @@ class RobotSpec:
             name=config.name,
             urdf=path,
             joints=tuple(config.joints),
-            base=chain[0].parent,
-            end_effector=config.end_effector,
+            base=base,
+            end_effector=tip,
             home=np.array(config.home, dtype=np.float64),
             position_limit=np.array([_position_limit(joint) for joint in joints]),
             velocity_limit=np.array([joint.limit.velocity for joint in joints], dtype=np.float64),
             effort_limit=np.array([joint.limit.effort for joint in joints], dtype=np.float64),
             command=Quantity(config.command),
+            offset=config.action == "offset",
             command_limit=np.array(config.command_limit, dtype=np.float64),
             position_gain=config.position_gain,
+            servo=servo,
+            floating=floating,
             damping=_dynamics(joints, "damping", config.damping),
             friction=_dynamics(joints, "friction", config.friction),
             gravity=np.array(config.gravity, dtype=np.float64),

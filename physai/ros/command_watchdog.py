@@ -1,6 +1,6 @@
 """A relay before a controller that has no timeout: when commands stop, it stops the arm.
 
-The inference node (with -p watchdog:=/command_watchdog) publishes to ~/commands; this node passes commands on. It stops
+The inference node (with -p watchdog:=command_watchdog) publishes to ~/commands; this node passes commands on. It stops
 the arm when none has come for a while, and, until ~/reset, when another publisher has commanded the controller, one
 that does not publish ~/commands, too. It listens only while a controller listens to it, so that who commands it knows.
 It publishes ~/heartbeat while it can hear them, so that who commands it can stop the arm when it hangs or dies. Run it

@@ -1,6 +1,5 @@
 """``python -m physai.ros.demo``: an exported policy drives the virtual robot over ROS 2 (see ``--help``)."""
 
-import json
 import os
 import signal
 import sys
@@ -14,11 +13,12 @@ from omegaconf import DictConfig
 from rich.console import Console
 
 from physai import cli
-from physai.compose import compose, conf_dir
+from physai.compose import compose
 from physai.config import Config, Count, PositiveFloat, Seed, validate
-from physai.deploy import ControllerConfig, Metadata, load_policy, read_metadata
+from physai.deploy import ControllerConfig, load_policy, read_metadata
 from physai.deploy.limits import smallest_margin
 from physai.errors import UserError
+from physai.ros.driving.policies import newest_policies, robot_overrides
 
 
 class DemoConfig(Config):
@@ -45,34 +45,11 @@ class DemoConfig(Config):
         """
         if self.policy_path is not None:
             return Path(self.policy_path)
-        found = sorted(Path("outputs").glob("**/policy.pt"), key=lambda path: path.stat().st_mtime)
-        if not found:
-            raise UserError(
-                "no policy.pt in outputs/: train one (python -m physai.train), or name one with policy_path=..."
-            )
-        return found[-1]
+        return newest_policies()[0]
 
     def picture(self) -> Path:
         """Where the picture goes."""
         return Path(self.output) if self.output else self.path().with_name("demo.png")
-
-
-def robot_overrides(metadata: Metadata) -> list[str]:
-    """What makes the virtual robot the one that the policy was trained on: Hydra overrides of its env.
-
-    Raises:
-        UserError: If ``conf/robot`` has no such robot: a URDF that a policy file names is not read.
-    """
-    robot = metadata.raw["config"]["env"]["robot"]
-    files = [path.stem for path in (conf_dir() / "robot").glob("*.yaml")]
-    if metadata.robot not in files:
-        raise UserError(f"the policy is for '{metadata.robot}', and conf/robot has only {', '.join(sorted(files))}")
-    changed = ("joints", "end_effector", "home", "command", "command_limit", "position_gain", "gravity")
-    return [
-        f"robot@env.robot={metadata.robot}",
-        *(f"env.robot.{key}={json.dumps(robot[key])}" for key in changed),
-        f"env.start.spread={json.dumps([0.0] * len(robot['joints']))}",
-    ]
 
 
 def _check(node: DictConfig) -> None:

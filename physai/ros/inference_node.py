@@ -12,18 +12,18 @@ from rclpy.exceptions import NameValidationException
 from std_msgs.msg import Bool, String
 from std_srvs.srv import SetBool
 
-from physai.deploy import Command, Controller, ControllerConfig, Goal, Policy, State, load_policy
+from physai.deploy import Command, Controller, ControllerConfig, Driver, Goal, State, load_policy
 from physai.deploy.goals import GoalError, accept
+from physai.deploy.metadata import describe_goal
 from physai.deploy.parameters import parameter
 from physai.errors import UserError
 from physai.ros.node import outlet
 from physai.ros.node.estop_file import EmergencyStopFile
 from physai.ros.node.run import StoppableNode, brief, run
-from physai.ros.topics import goals, qos
+from physai.ros.topics import description, goals, qos
 from physai.ros.topics.commands import JointCommands
 from physai.ros.topics.diagnostics import Timing, diagnose, summary
-from physai.ros.topics.emergency_stop import TOPIC as EMERGENCY_STOP
-from physai.ros.topics.emergency_stop import EmergencyStopTopic
+from physai.ros.topics.emergency_stop import EmergencyStopTopics
 from physai.ros.topics.joint_states import JointStates
 from physai.ros.topics.watched_commands import WatchedCommands
 from physai.signals import Quantity
@@ -51,7 +51,7 @@ class InferenceConfig(ControllerConfig):
         (), "a goal to start with, in the policy's unit, order and frame; empty: none", "", -100.0, 100.0, fixed=True
     )
     watchdog: str = parameter(
-        "", "the command_watchdog that passes commands on, such as /command_watchdog; empty: none", fixed=True
+        "", "the command_watchdog that passes commands on, such as command_watchdog; empty: none", fixed=True
     )
     watchdog_timeout: float = parameter(0.1, "a watchdog silent for this long does not answer", "s", 0.01, 10.0)
 
@@ -59,18 +59,21 @@ class InferenceConfig(ControllerConfig):
 class InferenceNode(StoppableNode[InferenceConfig]):
     """A thin shell of ROS around :class:`physai.deploy.Controller`; docs/ros2.md lists its topics and services.
 
+    Args:
+        kind: Its parameters.
+
     Raises:
         UserError: If a parameter or the policy file is wrong.
     """
 
-    def __init__(self) -> None:
-        super().__init__("inference_node", InferenceConfig)
+    def __init__(self, kind: type[InferenceConfig] = InferenceConfig) -> None:
+        super().__init__("inference_node", kind)
         config = self.config
         self._known = time.monotonic() + _DISCOVERY  # when who else commands the robot will surely have been found
         self._arrived = time.monotonic()  # when commands reached the robot, for the last time
-        policy = _load(config)
+        policy = self.load()
         self._controller = Controller(policy, config)
-        self._goal = _first_goal(config, policy)
+        self._goal = self.first_goal(policy)
         self._robot = JointStates(self, policy.metadata.joints, self._on_joint_states)
         self._command = Command(None, State.WAITING, ())
         self._stop_file = EmergencyStopFile(self.get_fully_qualified_name(), self.context.get_domain_id())
@@ -90,9 +93,11 @@ class InferenceNode(StoppableNode[InferenceConfig]):
         self._states = self.create_publisher(String, "~/state", qos.LATCHED)
         self._estopped = self.create_publisher(Bool, "~/estopped", qos.LATCHED)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
+        self._descriptions = self.create_publisher(String, description.TOPIC, qos.LATCHED)
+        self._asked = self.create_publisher(String, goals.DESCRIPTION, qos.LATCHED)
         taken = self.create_subscription(goals.goal_type(policy.metadata.goal), "~/goal", self._take_goal, 1)
         self._goal_topic = taken.topic_name
-        self._stop_topic = EmergencyStopTopic(self, lambda: self._emergency_stop(f"by {EMERGENCY_STOP}"))
+        self._stop_topics = EmergencyStopTopics(self, lambda topic: self._emergency_stop(f"by {topic}"))
         self.create_service(SetBool, "~/enable", self._enable)
         self.offer("~/estop", self._estop)
         self.offer("~/reset", self._reset)
@@ -106,15 +111,31 @@ class InferenceNode(StoppableNode[InferenceConfig]):
             self._emergency_stop("before this start")
         else:
             self._announce()
+        if (urdf := description.urdf(policy.metadata, self._frames())) is not None:
+            self._descriptions.publish(String(data=urdf))
+        self._asked.publish(String(data=describe_goal(policy.metadata)))
         self.get_logger().info(
             f"{config.policy_path} drives {list(policy.metadata.joints)} of '{policy.metadata.robot}', at most "
             f"{config.max_velocity:g} rad/s; {self._waits_for()}"
         )
 
+    def _frames(self) -> str:
+        """What the names of this robot's frames begin with."""
+        namespace = self.get_namespace().strip("/")
+        return f"{namespace}/" if namespace else ""
+
     def _waits_for(self) -> str:
         if self._stop_file.stopped:
             return f"stopped until ~/reset ({self._stop_file.path})"
         return "starting by itself" if self._enabled else "waiting for ~/enable"
+
+    def load(self) -> Driver:
+        """Return what drives; may raise a UserError."""
+        return _load(self.config)
+
+    def first_goal(self, policy: Driver) -> Goal | None:
+        """Return the goal to start with; may raise a UserError."""
+        return _first_goal(self.config, policy)
 
     def configure(self, config: InferenceConfig) -> None:
         """Have the controller and the way to the robot take other values."""
@@ -152,7 +173,7 @@ class InferenceNode(StoppableNode[InferenceConfig]):
         return True, "stopped until ~/reset"
 
     def _reset(self) -> tuple[bool, str]:
-        if (held := self._stop_topic.held()) is not None:
+        if (held := self._stop_topics.held()) is not None:
             return False, held
         latched = self._controller.reset()
         if latched:
@@ -287,7 +308,9 @@ class InferenceNode(StoppableNode[InferenceConfig]):
             values["goals of another type"] = said
             self.get_logger().warning(said, throttle_duration_sec=10.0)
         now = self.get_clock().now().to_msg()
-        self._diagnostics.publish(diagnose(self.get_name(), now, self._controller.policy, values))
+        self._diagnostics.publish(
+            diagnose(self.get_fully_qualified_name().lstrip("/"), now, self._controller.policy, values)
+        )
 
     def finish(self) -> None:
         """See that the last command that the robot got stands still."""
@@ -305,7 +328,7 @@ def _commands(node: InferenceNode, joints: int, quantity: Quantity, config: Infe
         raise UserError(f"watchdog: must be the name of a node, got '{config.watchdog}': {brief(error)}") from error
 
 
-def _load(config: InferenceConfig) -> Policy:
+def _load(config: InferenceConfig) -> Driver:
     if not config.policy_path:
         raise UserError("policy_path: required, such as -p policy_path:=outputs/<run>/policy.pt")
     if not config.policy_sha256:
@@ -327,7 +350,7 @@ def _load(config: InferenceConfig) -> Policy:
     return policy
 
 
-def _first_goal(config: InferenceConfig, policy: Policy) -> Goal | None:
+def _first_goal(config: InferenceConfig, policy: Driver) -> Goal | None:
     if not config.goal:
         return None
     goal = Goal(list(config.goal), policy.metadata.goal.frame)

@@ -12,7 +12,7 @@ from physai.deploy import JointState
 from physai.deploy.parameters import parameter
 from physai.errors import UserError
 from physai.ros.node.run import StoppableNode, run
-from physai.ros.topics import qos
+from physai.ros.topics import joint_states, qos
 from physai.ros.topics.commands import controller_topic
 from physai.ros.virtual.arm import GroupController, VirtualArm
 from physai.ros.virtual.faults import FaultConfig, Faults
@@ -32,7 +32,7 @@ class VirtualRobotConfig(FaultConfig):
     rate_hz: float = parameter(100.0, "joint states per second, and physics steps", "Hz", 1.0, 1000.0, fixed=True)
     joints: tuple[str, ...] = parameter((), "joints of the commands, in their order; empty: the robot's", fixed=True)
     state_joints: tuple[str, ...] = parameter(
-        (), "joints in /joint_states, in their order; unknown ones stand still; empty: as joints", fixed=True
+        (), "joints in joint_states, in their order; unknown ones stand still; empty: as joints", fixed=True
     )
     command_timeout: float = parameter(0.0, "a command is over after this; 0: it holds for ever", "s", 0.0, 60.0)
 
@@ -41,7 +41,7 @@ _LONGEST_PAUSE = 1.0  # s that the arm makes up for; in a longer one, such as a 
 
 
 class VirtualRobot(StoppableNode[VirtualRobotConfig]):
-    """Publishes /joint_states, and obeys the commands of its robot's controller as the real one does.
+    """Publishes joint_states, and obeys the commands of its robot's controller as the real one does.
 
     Raises:
         UserError: If a parameter is wrong.
@@ -65,7 +65,7 @@ class VirtualRobot(StoppableNode[VirtualRobotConfig]):
         rest = self._arm.rest[[known.index(joint) for joint in joints]]
         self._controller = GroupController(rest, self._arm.spec.command, config.command_timeout)
         self._faults = Faults(config, config.seed)
-        self._states = self.create_publisher(JointStateMessage, "/joint_states", 10)
+        self._states = self.create_publisher(JointStateMessage, joint_states.TOPIC, 10)
         commands = controller_topic(self._arm.spec.command)
         self.create_subscription(Float64MultiArray, commands, self._take_command, qos.COMMAND)
         self.offer("~/reset", self._reset)
@@ -98,12 +98,15 @@ class VirtualRobot(StoppableNode[VirtualRobotConfig]):
         for _ in range(max(1, round((now - self._at) / self._period))):
             self._at += self._period
             position, velocity = self._arm.step(self._controller.value(self._at)[self._order])
-        positions, velocities = [0.0] * len(self._names), [0.0] * len(self._names)
+        positions, velocities, efforts = ([0.0] * len(self._names) for _ in range(3))
         for place, joint in self._shown:
             positions[place], velocities[place] = float(position[joint]), float(velocity[joint])
+            efforts[place] = float(self._arm.effort[joint])
         stamp = self.get_clock().now().nanoseconds * 1e-9
-        for state in self._faults.apply(JointState(self._names, positions, velocities, stamp), now):
-            message = JointStateMessage(name=state.names, position=state.position, velocity=state.velocity)
+        for state in self._faults.apply(JointState(self._names, positions, velocities, stamp, effort=efforts), now):
+            message = JointStateMessage(
+                name=state.names, position=state.position, velocity=state.velocity, effort=state.effort
+            )
             message.header.stamp = Time(nanoseconds=round(state.stamp * 1e9)).to_msg()
             self._states.publish(message)
 

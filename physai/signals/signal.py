@@ -14,6 +14,11 @@ class Quantity(str, Enum):
     JOINT_VELOCITY = "joint_velocity"  # rad/s, one a joint
     POSITION = "position"  # a point in a frame, m
     POSE = "pose"  # a point in a frame, m, then a quaternion x, y, z, w; its opposite is the same pose
+    ANGULAR_VELOCITY = "angular_velocity"  # about the axes of a frame, rad/s
+    DIRECTION = "direction"  # a vector of length 1 in a frame
+    TWIST = "twist"  # x and y velocity, m/s, and yaw rate, rad/s, in a frame
+    ACTION = "action"  # what a policy asked for, in [-1, 1], one a joint
+    TIME = "time"  # s
     MEMORY = "memory"  # what a policy remembers
     VIEW = "view"  # what a policy sees, of more than one quantity
 
@@ -23,7 +28,13 @@ class Quantity(str, Enum):
         return _UNITS.get(self, "")
 
 
-_UNITS = {Quantity.JOINT_POSITION: "rad", Quantity.JOINT_VELOCITY: "rad/s", Quantity.POSITION: "m"}
+_UNITS = {
+    Quantity.JOINT_POSITION: "rad",
+    Quantity.JOINT_VELOCITY: "rad/s",
+    Quantity.POSITION: "m",
+    Quantity.ANGULAR_VELOCITY: "rad/s",
+    Quantity.TIME: "s",
+}
 
 
 @dataclass(frozen=True)

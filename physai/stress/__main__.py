@@ -29,6 +29,7 @@ class StressConfig(PolicyChoice):
     grid: Annotated[Count, Field(ge=2)]
     episodes: Count
     breaks: bool
+    box: bool
     output: str | None
     seed: Seed
     axes: dict[str, AxisConfig]
@@ -69,6 +70,9 @@ def _stress(node: DictConfig, _: Path) -> None:
     from physai.plots.stress import plot_maps
 
     config = validate(StressConfig, node)
+    if config.box:
+        _box(config)
+        return
     maps: dict[str, Map] = {}
     name = f"stress_{config.x}_{config.y}"
     for run in config.runs:
@@ -94,6 +98,20 @@ def _stress(node: DictConfig, _: Path) -> None:
     output = Path(config.output or (Path(config.runs[0]) if len(maps) == 1 else Path()) / f"{name}.png")
     plot_maps(maps, output)
     print(f"Map: {output}; figures: {', '.join(str(Path(run) / name) + '.json' for run in maps)}")
+
+
+def _box(config: StressConfig) -> None:
+    table = Table(title="Boxes in which 95 % of the robots settle", title_justify="left")
+    for column in ("run", "of the ranges of", "share", "volume", "settled"):
+        table.add_column(column)
+    for run in config.runs:
+        with StressTest(config.load(run), config.episodes, config.seed, run) as test:
+            box = test.box()
+        settled = f"{box.settled:,} of {box.robots:,}"
+        table.add_row(run, box.randomization, f"{box.share:.3f}", f"{box.volume:.3g}", settled)
+        summary = {"run": run, "checkpoint": config.checkpoint, "seed": config.seed, **box.summary()}
+        write_atomically(Path(run) / f"box_{box.randomization}.json", json.dumps(summary, indent=2).encode())
+    Console().print(table)
 
 
 def _show(run: str, breaks: Breaks, config: StressConfig, policy: TrainedPolicy) -> None:

@@ -9,8 +9,9 @@ from pydantic import AfterValidator, Field
 from physai.config import Config, nearest
 from physai.envs.simulation import EnvConfig
 from physai.errors import UserError
-from physai.physics import RandomizationConfig
+from physai.physics import ParameterLayout, RandomizationConfig
 from physai.physics.randomization import Draw, Normal, Uniform
+from physai.robots import RobotSpec
 
 _WHOLE = ("actuator_delay",)
 
@@ -54,6 +55,9 @@ class Axis:
         if name not in axes:
             raise UserError(f"there is no axis '{name}'{nearest(name, axes)}")
         axis = cls(name, axes[name].operation, *axes[name].range)
+        robot = RobotSpec.from_config(config.robot)
+        if axis.randomizes and name not in ParameterLayout(robot).columns:
+            raise UserError(f"the axis '{name}' is not one of robot '{robot.name}', which has no such parameter")
         if name == "motor_time_constant" and config.physics.get("motor") != "servo":
             raise UserError(f"the axis '{name}' needs physics=mujoco physics.motor=servo")
         if axis.whole and not (float(axis.low).is_integer() and float(axis.high).is_integer()):
@@ -100,7 +104,7 @@ class Axis:
             return nominal, nominal
         if isinstance(draw, Normal):
             return max(draw.mean - 2 * draw.std, nominal), draw.mean + 2 * draw.std
-        return draw.low, draw.high
+        return float(np.min(draw.low)), float(np.max(draw.high))
 
     def draw(self, value: float) -> Uniform:
         """What makes randomization give every robot this value."""

@@ -14,6 +14,7 @@ from rich.progress import track
 
 from physai import processes
 from physai.stress.axes import Axis
+from physai.stress.box import Box, find_box
 from physai.stress.trial import Count, Setting, Trial
 from physai.training.evaluation import wilson
 from physai.training.run import TrainedPolicy
@@ -107,6 +108,10 @@ class StressTest:
             for axis, low, high in zip(axes, found[::2], found[1::2], strict=True)
         }
 
+    def box(self) -> Box:
+        """Look for the largest box in which the policy settles."""
+        return self._pool.submit(_box).result()
+
     def _shown(self, what: str, results: Iterable[Any], total: int) -> Iterable[Any]:
         """The results as they come, with a bar on a terminal."""
         return track(results, f"{self._name}: {what}", total, disable=not sys.stdout.isatty())
@@ -122,6 +127,11 @@ def _begin(parent: int, policy: TrainedPolicy, episodes: int, seed: int) -> None
 def _count(settings: list[Setting]) -> Count:
     assert _trial is not None
     return _trial.count(settings, _trial.policy.randomization)
+
+
+def _box() -> Box:
+    assert _trial is not None
+    return find_box(_trial, _trial.policy.randomization)
 
 
 def _breaks(axis: Axis, end: float) -> dict[str, float | None]:

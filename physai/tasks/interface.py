@@ -1,7 +1,8 @@
 """What a task is: a goal, what a policy sees of it, and how a step is judged."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Protocol
+from typing import ClassVar, Protocol
 
 import numpy as np
 import torch
@@ -16,14 +17,19 @@ class ObservationModule(nn.Module):
     """From what a robot senses to what its policy sees; scriptable, and part of the exported policy.
 
     Attributes:
+        senses: The signals that it maps, in the order of its arguments, of those that the robot has
+            (:attr:`physai.envs.simulation.Simulation.senses`); the goal comes after them.
         suggests: Whether the last n features are the latent actions of a controller without learning, to which a
             :class:`physai.policies.ResidualActor` adds.
     """
 
+    senses: tuple[str, ...] = ("joint_position", "joint_velocity")
     suggests: bool = False
 
     def forward(self, joint_position: Tensor, joint_velocity: Tensor, goal: Tensor) -> tuple[Tensor, Tensor]:
         """Map positions [N, n] rad, velocities [N, n] rad/s and goals [N, g] to observation and features.
+
+        A module with other ``senses`` has other arguments.
 
         Returns:
             Observation [N, o], which is normalized, and features [N, f], which a policy sees as they are.
@@ -49,6 +55,8 @@ class Step:
         error: How far they are from it, one column a tolerance, [N, e].
         held: For how long all errors have been within their tolerances without a break, s, [N].
         clearance: How far the robots are from touching anything, m, [N]; None where the task does not look at that.
+        length: Control steps since the episode began, [N].
+        mean_error: Mean of each error since then, [N, e].
     """
 
     state: RobotState
@@ -58,7 +66,9 @@ class Step:
     goal: np.ndarray
     error: np.ndarray
     held: np.ndarray
-    clearance: np.ndarray | None = None
+    clearance: np.ndarray | None
+    length: np.ndarray
+    mean_error: np.ndarray
 
 
 class Task(Protocol):
@@ -74,6 +84,8 @@ class Task(Protocol):
         observation: What the observation module makes, with bounds.
         module: The observation module.
         max_steps: Control steps until an episode is truncated.
+        goal_steps: Control steps after which another goal is asked for in the midst of an episode; 0: never.
+        needs_end_effector: Whether it is for robots that have one; others get no kinematics.
         surroundings: The robot's capsules and what stands around, where the task looks at collisions; else None.
     """
 
@@ -83,6 +95,8 @@ class Task(Protocol):
     observation: Signal
     module: ObservationModule
     max_steps: int
+    goal_steps: int = 0
+    needs_end_effector: ClassVar[bool] = True
     surroundings: CollisionModel | None = None
 
     def success(self, step: Step) -> np.ndarray:
@@ -108,8 +122,8 @@ class Task(Protocol):
         return self.module.error(*(torch.from_numpy(array).float() for array in arrays)).numpy()
 
     @torch.no_grad()
-    def observe(self, state: RobotState, goal: np.ndarray) -> np.ndarray:
-        """Return the observation of the true state, [N, o], as the module makes it."""
-        arrays = state.joint_position, state.joint_velocity, goal
+    def observe(self, sensed: Mapping[str, np.ndarray]) -> np.ndarray:
+        """Return the observation of what a robot senses and its goal, by name, [N, o], as the module makes it."""
+        arrays = (sensed[name] for name in (*self.module.senses, "goal"))
         observation, _ = self.module(*(torch.from_numpy(array).float() for array in arrays))
         return observation.numpy()

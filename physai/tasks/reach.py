@@ -1,6 +1,7 @@
 """Reach: bring the end effector to a point of the base frame's x-y plane."""
 
 import math
+from collections.abc import Mapping
 from typing import Annotated, Any
 
 import numpy as np
@@ -114,10 +115,11 @@ class Reach(Reaching):
         apart = self._end_effector(state.joint_position)[:, :2] - goal
         return np.hypot(apart[:, :1], apart[:, 1:])
 
-    def observe(self, state: RobotState, goal: np.ndarray) -> np.ndarray:
+    def observe(self, sensed: Mapping[str, np.ndarray]) -> np.ndarray:
         """Return the observation, [N, 2n + 4]."""
-        end_effector = self._end_effector(state.joint_position)[:, :2]
-        seen = np.concatenate([state.joint_position, state.joint_velocity, end_effector, goal], axis=1)
+        position = sensed["joint_position"]
+        end_effector = self._end_effector(position)[:, :2]
+        seen = np.concatenate([position, sensed["joint_velocity"], end_effector, sensed["goal"]], axis=1)
         for joint in self._continuous:
             seen[:, joint] = (seen[:, joint] + math.pi) % (2 * math.pi) - math.pi
         return seen.astype(np.float32)

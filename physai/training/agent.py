@@ -64,11 +64,23 @@ class Agent:
         device = torch.device(config.device)
         if device.type == "cuda" and (device.index or 0) >= torch.cuda.device_count():
             raise UserError(f"device={config.device}: torch finds {torch.cuda.device_count()} GPUs here")
+        taught = {}
+        if "teacher" in config.algo:
+            from physai.training.teacher import load_teacher  # a trained policy, which is made of what is made here
+
+            taught["teacher"] = load_teacher(config)
         torch.set_num_threads(config.threads)
         torch.manual_seed(derive(config.seed, "learner"))
-        memory = config.policy.memory_size
-        make_robots = partial(make_env, config.env, config.randomization, config.normalization, memory_size=memory)
+        memory = config.memory_size
+        pinned = None if config.curriculum is None else config.curriculum.pinned
+        make_robots = partial(
+            make_env, config.env, config.randomization, config.normalization, memory_size=memory, pinned=pinned
+        )
         env = make_robots(config.collector.envs_of_learner, derive(config.seed, "train"))
+        if env.ranges is not None and not env.ranges.sides:
+            raise UserError(
+                f"curriculum: nothing of randomization={config.randomization.name} has a range that can grow"
+            )
         actor = make_actor(config, env).to(device)
         judged = Composite(**env.observation_spec, **env.full_action_spec, shape=env.batch_size)
         inputs = input_size(judged, config.policy.critic.get("in_keys"), "policy.critic")
@@ -79,6 +91,7 @@ class Agent:
             needs=("update", "weights", "state", "set_state", "warmup_frames"),
             networks=Networks(actor, critic, env.normalizer),
             frames_per_batch=config.collector.frames_per_batch,
+            **taught,
         )
         collector = make_collector(
             config.collector,
@@ -147,8 +160,10 @@ def make_actor(config: TrainConfig, env: TransformedRobotEnv) -> TensorDictModul
     inputs = input_size(env.observation_spec, config.policy.actor.get("in_keys"), "policy.actor")
     sizes = {"in_features": inputs, "action_size": env.action_spec.shape[-1]}
     actor = make("policy.actor", config.policy.actor, needs=(*_NETWORK, "deterministic"), **sizes)
-    if getattr(actor, "memory_size", 0) != config.policy.memory_size:  # the env is made first, from the config
-        raise UserError("policy.actor: how much an actor remembers is its argument memory_size")
+    if getattr(actor, "memory_size", 0) != config.memory_size:  # the env is made first, from the config
+        raise UserError(
+            "policy.actor: how much an actor remembers is its argument memory_size, and past_actions of each joint"
+        )
     if getattr(actor, "residual", False) and not env.simulation.task.module.suggests:
         raise UserError(f"policy.actor: it adds to what the task suggests, and that of '{config.env.name}' does not")
     return actor
@@ -170,7 +185,7 @@ def make_evaluation_env(
 ) -> TransformedRobotEnv:
     """Build an env of its own for evaluation, with random numbers that training never uses."""
     seed = derive(seed, "evaluation")
-    return make_env(config.env, randomization, config.normalization, num_envs, seed, config.policy.memory_size)
+    return make_env(config.env, randomization, config.normalization, num_envs, seed, config.memory_size)
 
 
 def make_logger(config: TrainConfig, run_dir: Path) -> Any:

@@ -1,6 +1,7 @@
 """What a run does beside learning: evaluate, log, save, show how far it is."""
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -11,10 +12,12 @@ from physai.seeding import derive
 from physai.training import checkpoint
 from physai.training.agent import make_evaluation_env
 from physai.training.config import TrainConfig
-from physai.training.evaluation import MAX_ROBOTS, Evaluation, evaluate
+from physai.training.evaluation import MAX_ROBOTS, Evaluation, Recording, evaluate
 from physai.training.logs import RunLog
 from physai.training.progress import Progress
 from physai.training.trainer import Callback, Trainer
+
+Watch = Callable[[int, Recording], object]
 
 EVALUATION_SEED = derive(0, "evaluation goals while training")  # the same goals for every run, unseen in training
 
@@ -26,6 +29,7 @@ class EvaluationCallback(Callback):
 
     Args:
         config: The run's.
+        watch: Gets some episodes of each evaluation, and how many frames the policy has learned from.
 
     Attributes:
         best_frames: How many frames the best policy has learned from.
@@ -33,8 +37,9 @@ class EvaluationCallback(Callback):
 
     name = "evaluation"
 
-    def __init__(self, config: TrainConfig) -> None:
+    def __init__(self, config: TrainConfig, watch: Watch | None = None) -> None:
         self._config = config
+        self._watch = watch
         self._env: TransformedRobotEnv | None = None
         self._best = [-1.0, 0.0, 0.0]
         self.best_frames = 0
@@ -45,7 +50,8 @@ class EvaluationCallback(Callback):
             return
         with trainer.untimed():
             result = self._evaluate(trainer)
-            score = [result.success_rate, result.settled_rate, float(result.episode_return.mean())]
+            settled = 0.0 if result.mean_error else result.settled_rate  # where goals change, nobody stays at one
+            score = [result.success_rate, settled, float(result.episode_return.mean())]
             if score >= self._best or not trainer.folder.best.is_file():
                 self._best, self.best_frames = score, trainer.clock.frames
                 content = {"frames": trainer.clock.frames, **trainer.agent.policy_state()}
@@ -60,7 +66,8 @@ class EvaluationCallback(Callback):
             randomization = self._config.evaluation.randomization
             self._env = make_evaluation_env(self._config, randomization, robots, EVALUATION_SEED)
         self._env.normalizer.load_state_dict(trainer.agent.statistics.normalizer.state_dict())
-        return evaluate(trainer.agent.policy(), self._env, goals, EVALUATION_SEED)
+        watch = None if self._watch is None else partial(self._watch, trainer.clock.frames)
+        return evaluate(trainer.agent.policy(), self._env, goals, EVALUATION_SEED, watch)
 
     def state(self) -> dict[str, Any]:
         """See :class:`Callback`."""

@@ -1,7 +1,9 @@
 """Judging a policy: deterministic episodes, all goals at once; and goals one after the other."""
 
 import math
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import torch
@@ -12,6 +14,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from physai.envs.make import TransformedRobotEnv
 
 MAX_ROBOTS = 1000
+WATCHED = 8  # robots whose episodes are recorded, if somebody watches
 ROBOTS_IN_A_ROW = 64
 SETTLED = 0.5  # s, at the end of an episode's time
 NEAR_LIMIT = 0.05  # rad
@@ -51,6 +54,8 @@ class Evaluation:
         action_change: By how much the action changed from step to step; 1 is a joint's largest command.
         acceleration: Mean of each control period, rad/s².
         unit: Of the error.
+        mean_error: Each of the task's errors by name, its mean over all of the episodes, and its unit; none where a
+            goal lasts an episode, whose end says more.
     """
 
     success: Tensor
@@ -62,6 +67,7 @@ class Evaluation:
     action_change: Tensor
     acceleration: Tensor
     unit: str
+    mean_error: Mapping[str, tuple[float, str]] = field(default_factory=dict)
 
     @property
     def success_rate(self) -> float:
@@ -83,10 +89,11 @@ class Evaluation:
         """95 % confidence interval of the settled rate."""
         return wilson(self.settled)
 
-    def summary(self) -> dict[str, float | list[float] | str | None]:
+    def summary(self) -> dict[str, Any]:
         """The figures that scripts rely on.
 
         ``steps_to_goal`` averages over reached goals, and is None without any; ``final_distance`` is the mean error.
+        Where goals change in an episode, ``mean_error`` has value and unit of each error.
         """
         reached = self.length[self.success]
         return {
@@ -102,7 +109,23 @@ class Evaluation:
             "return": float(self.episode_return.double().mean()),
             **_mean_and_p99("action_change", self.action_change),
             **_mean_and_p99("acceleration", self.acceleration),
+            **({"mean_error": {name: list(told) for name, told in self.mean_error.items()}} if self.mean_error else {}),
         }
+
+
+@dataclass(frozen=True)
+class Recording:
+    """The episodes of K robots in an evaluation, T steps each; what came after a success is in it, too.
+
+    Attributes:
+        joint_position: rad, [T, K, n].
+        goal: [K, g].
+        success: Whether the episodes were one, [K].
+    """
+
+    joint_position: np.ndarray
+    goal: np.ndarray
+    success: np.ndarray
 
 
 def _mean_and_p99(name: str, values: Tensor) -> dict[str, float]:
@@ -110,7 +133,13 @@ def _mean_and_p99(name: str, values: Tensor) -> dict[str, float]:
     return {f"{name}_mean": float(array.mean()), f"{name}_p99": float(np.quantile(array, 0.99))}
 
 
-def evaluate(policy: TensorDictModuleBase, env: TransformedRobotEnv, episodes: int, seed: int) -> Evaluation:
+def evaluate(
+    policy: TensorDictModuleBase,
+    env: TransformedRobotEnv,
+    episodes: int,
+    seed: int,
+    watch: Callable[[Recording], object] | None = None,
+) -> Evaluation:
     """Let a policy act deterministically for one episode per goal; the goals follow from the seed alone.
 
     After a success a robot goes on towards the same goal for the rest of the episode's time: nothing else shows
@@ -121,29 +150,38 @@ def evaluate(policy: TensorDictModuleBase, env: TransformedRobotEnv, episodes: i
         env: Its robots each play one episode at a time; its normalization is used as it is.
         episodes: How many goals.
         seed: Seeds goals, starts, and whatever the env randomizes.
+        watch: Gets the first episodes of the first robots.
     """
     env.set_seed(seed)
-    rounds = [_one_round(policy, env) for _ in range(-(-episodes // env.simulation.num_envs))]
+    robots = env.simulation.num_envs
+    rounds = [_one_round(policy, env, None if first else watch) for first in range(0, episodes, robots)]
     columns = {key: torch.cat([each[key] for each in rounds])[:episodes] for key in rounds[0]}
-    return Evaluation(**columns, unit=env.simulation.task.tolerances[0].unit)
+    task, means = env.simulation.task, columns.pop("mean_error").double().mean(dim=0).tolist()
+    told = {each.name: (mean, each.unit) for each, mean in zip(task.tolerances, means, strict=True)}
+    return Evaluation(**columns, unit=task.tolerances[0].unit, mean_error=told if task.goal_steps else {})
 
 
 @torch.no_grad()
-def _one_round(policy: TensorDictModuleBase, env: TransformedRobotEnv) -> dict[str, Tensor]:
-    """Return the columns of an Evaluation, but for the unit."""
+def _one_round(
+    policy: TensorDictModuleBase, env: TransformedRobotEnv, watch: Callable[[Recording], object] | None
+) -> dict[str, Tensor]:
+    """Return the columns of an Evaluation, and the means of all errors, [E, e]."""
     simulation, tensordict = env.simulation, env.reset()
     task, dt, robots = simulation.task, simulation.config.control_dt, simulation.num_envs
     columns = [i for i, tolerance in enumerate(task.tolerances) if tolerance.unit == task.tolerances[0].unit]
     finished, success, crashed = torch.zeros(3, robots, dtype=torch.bool)
     length, first = torch.zeros(2, robots, dtype=torch.int64)
     error, episode_return = torch.zeros(2, robots)
-    changes, accelerations = [], []
+    mean_error = torch.zeros(robots, len(task.tolerances))
+    changes, accelerations, path = [], [], []
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         for _ in range(task.max_steps):
             action, velocity = simulation.last_action, simulation.state.joint_velocity
             tensordict = env.step(policy(tensordict)).get("next")
             changes.append(np.abs(simulation.last_action - action))
             accelerations.append(np.abs(simulation.state.joint_velocity - velocity) / dt)
+            if watch is not None:
+                path.append(simulation.state.joint_position[:WATCHED])
             succeeds, steps = tensordict.get("success")[:, 0], tensordict.get("episode_length")[:, 0]
             first = torch.where(succeeds & (first == 0), steps, first)
             crashed |= tensordict.get("terminated")[:, 0] & ~succeeds
@@ -152,7 +190,10 @@ def _one_round(policy: TensorDictModuleBase, env: TransformedRobotEnv) -> dict[s
             success[now] = succeeds[now]
             length[now] = torch.where(succeeds, first, steps)[now]
             error[now] = torch.from_numpy(simulation.error[:, columns].max(axis=1)).float()[now]
+            mean_error[now] = torch.from_numpy(simulation.error_sum / steps.numpy().clip(1)[:, None]).float()[now]
             episode_return[now] = tensordict.get("episode_rewards").sum(dim=1)[now]
+    if watch is not None:
+        watch(Recording(np.stack(path), simulation.goal[:WATCHED], success[:WATCHED].numpy()))
     stayed = simulation.within >= min(math.ceil(SETTLED / dt - 1e-9), task.max_steps)
     return {
         "success": success,
@@ -160,6 +201,7 @@ def _one_round(policy: TensorDictModuleBase, env: TransformedRobotEnv) -> dict[s
         "crashed": crashed,
         "length": length,
         "error": error,
+        "mean_error": mean_error,
         "episode_return": episode_return,
         "action_change": torch.from_numpy(np.concatenate(changes, axis=1)).float(),
         "acceleration": torch.from_numpy(np.concatenate(accelerations, axis=1)).float(),

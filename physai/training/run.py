@@ -24,8 +24,9 @@ from physai.physics import RandomizationConfig
 from physai.seeding import derive
 from physai.training import checkpoint
 from physai.training.agent import Agent, load_policy_state, make_actor, make_evaluation_env, make_logger
-from physai.training.callbacks import CheckpointCallback, EvaluationCallback, LogCallback, ProgressCallback
+from physai.training.callbacks import CheckpointCallback, EvaluationCallback, LogCallback, ProgressCallback, Watch
 from physai.training.config import TrainConfig
+from physai.training.curriculum import CurriculumCallback
 from physai.training.evaluation import (
     MAX_ROBOTS,
     ROBOTS_IN_A_ROW,
@@ -63,7 +64,11 @@ def load_config(
 
 
 def run_training(
-    config: TrainConfig, run_dir: Path, resume: bool = False, agent: Agent | None = None
+    config: TrainConfig,
+    run_dir: Path,
+    resume: bool = False,
+    agent: Agent | None = None,
+    watch: Watch | None = None,
 ) -> dict[str, Any]:
     """Train in ``run_dir`` and write ``summary.json``; return the summary.
 
@@ -72,6 +77,7 @@ def run_training(
         run_dir: Where everything goes.
         resume: Whether to go on with an interrupted run.
         agent: Just built from ``config``, if it has been already; it is closed at the end.
+        watch: See :class:`EvaluationCallback`.
     """
     done = run_dir / "summary.json"
     if resume and done.is_file():
@@ -91,7 +97,7 @@ def run_training(
             print(
                 f"randomization.{name} has no effect: it scales what is zero in '{robot}', unless its YAML gives some"
             )
-        evaluation = EvaluationCallback(config)
+        evaluation = EvaluationCallback(config, watch)
         trainer = make_trainer(config, run_dir, agent, evaluation, resume)
         trainer.fit(stop)
         if stop:
@@ -125,8 +131,11 @@ def make_trainer(
         UserError: If it cannot be resumed.
     """
     folder = checkpoint.CheckpointFolder(run_dir / "checkpoints", config.checkpoint.keep)
+    ranges = agent.env.ranges
+    curriculum = [] if config.curriculum is None or ranges is None else [CurriculumCallback(config.curriculum, ranges)]
     callbacks = [
         evaluation,
+        *curriculum,  # before what it says is logged, and where it is saved
         LogCallback(run_dir, partial(make_logger, config, run_dir)),
         CheckpointCallback(config.checkpoint.every_frames),
         ProgressCallback(),
@@ -209,8 +218,13 @@ class TrainedPolicy:
             env.close()
 
     def in_a_row(self, goals: int, seed: int = FINAL_SEED) -> dict[str, Any]:
-        """Evaluate it on so many goals one after the other; return the figures, none for robots not simulated."""
-        if not goals or not self.config.env.simulated:
+        """Evaluate it on so many goals one after the other.
+
+        Returns:
+            The figures; none of robots that are not simulated, or whose base floats: these get another goal in the
+            midst of an episode.
+        """
+        if not goals or not self.config.env.simulated or self.config.env.robot.floating is not None:
             return {}
         start = self.config.env.start.model_copy(update={"carried_over": 1.0})
         carried = self.config.env.model_copy(update={"start": start})
@@ -273,6 +287,8 @@ def print_summary(summary: dict[str, Any], title: str) -> None:
         rows[f"{summary['in_a_row']} in a row"] = rate(summary, "in_a_row")
         joint, share = max(summary["in_a_row_near_limit"].items(), key=lambda item: item[1])
         rows["near a limit"] = f"{share:.1%} of that time" + (f", {joint}" if share else "")
+    for name, (value, unit) in summary.get("mean_error", {}).items():
+        rows[f"mean error, {name}"] = f"{value:.3f} {unit}"
     rows |= {
         "steps to goal": "none reached" if steps is None else f"{steps:.1f}",
         "final distance": f"{summary['final_distance']:.3f} {summary['distance_unit']}",

@@ -1,4 +1,4 @@
-"""The policy's view: sensed joints and goal become the task's observation."""
+"""The policy's view: what a robot senses and its goal become the task's observation."""
 
 import torch
 from tensordict import TensorDictBase
@@ -9,14 +9,14 @@ from physai.tasks import ObservationModule
 
 
 class Observation(Transform):
-    """Writes ``observation`` and ``features`` from ``joint_position``, ``joint_velocity`` and ``goal``.
+    """Writes ``observation`` and ``features`` from what the task's module maps.
 
     Args:
         module: The task's observation module, the same that the exported policy carries.
     """
 
     def __init__(self, module: ObservationModule) -> None:
-        super().__init__(in_keys=["joint_position", "joint_velocity", "goal"], out_keys=["observation", "features"])
+        super().__init__(in_keys=[*module.senses, "goal"], out_keys=["observation", "features"])
         self.module = module
 
     @torch.no_grad()

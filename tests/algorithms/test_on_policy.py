@@ -159,6 +159,24 @@ def test_the_learning_rate_falls_along_its_schedule():
     assert rates == pytest.approx([0.01, 0.0075, 0.005])
 
 
+@pytest.mark.parametrize(("target", "rates"), [(1e6, [1e-4, 1.5e-4, 2.25e-4]), (1e-3, [1e-3, 1e-3 / 1.5, 1e-3 / 2.25])])
+def test_the_learning_rate_follows_from_how_far_the_policy_moves_where_that_is_asked(target, rates):
+    actor, critic, batch = small_batch()
+    batch["action_log_prob"] = batch["action_log_prob"] + 1.0  # as if the policy had moved by 1 nat since
+    overrides = ["algo.scheduler=null", f"algo.optimizer.lr={rates[0]}", f"algo.target_kl={target}"]
+    algorithm = build(actor, critic, 32, *overrides)
+    assert [algorithm.update(batch.clone())["lr"] for _ in range(3)] == pytest.approx(rates)
+    for _ in range(10):
+        last = algorithm.update(batch.clone())["lr"]
+    assert last == pytest.approx(1e-3 if target > 1 else 1e-5)  # and no further
+
+
+def test_a_loss_that_does_not_say_how_far_the_policy_moves_cannot_be_followed():
+    actor, critic, _ = small_batch()
+    with pytest.raises(UserError, match="target_kl: this loss does not say how far the policy moves"):
+        build(actor, critic, 32, "algo=a2c", "collector.frames_per_batch=32", "+algo.target_kl=0.01")
+
+
 def test_a_loss_that_is_not_finite_stops_before_the_step_and_hands_over_the_batch():
     actor, critic, batch = small_batch(reward=float("nan"))
     algorithm = build(actor, critic, 32)

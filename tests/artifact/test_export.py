@@ -3,6 +3,7 @@
 import hashlib
 import json
 import shutil
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,7 @@ from physai.artifact.onnx import describe
 from physai.deploy import load_policy, read_metadata
 from physai.deploy.metadata import metadata_sha256
 from physai.errors import UserError
+from physai.training.run import TrainedPolicy
 from tests.training.small import EXPORTED, TINY, command
 
 
@@ -32,6 +34,15 @@ def _few_goals_in_the_other_engine(monkeypatch):
 def copied(exported_run, tmp_path):
     shutil.copytree(exported_run, tmp_path / "run")
     return tmp_path / "run"
+
+
+@pytest.fixture(scope="module")
+def agreed(exported_run):
+    """The forms of its best policy, and its simulation: what is written may be checked without making them anew."""
+    trained = TrainedPolicy(exported_run, "best")
+    actor, env = trained.deploy(64, seed=0)
+    with closing(env):
+        yield module.agreeing_forms(actor, env, ["torchscript", "onnx"], lambda *_: None), env.simulation
 
 
 def metadata_of(run):
@@ -76,7 +87,7 @@ def test_the_metadata_says_everything_a_robot_must_know(exported_run):
     assert raw["config"]["total_frames"] == 120_000
     low, high = raw["evaluation"]["success_ci"]
     assert low <= raw["evaluation"]["success_rate"] <= high
-    assert raw["evaluation"]["episodes"] == 100
+    assert raw["evaluation"]["episodes"] == 200
     assert raw["versions"]["torch"] == torch.__version__
     assert {"physai", "torchrl"} <= set(raw["versions"])
     assert raw["created"].endswith("+00:00")
@@ -152,10 +163,15 @@ def test_a_policy_whose_hash_could_not_be_written_lies_beside_none_and_not_besid
     assert not path.with_name("policy.pt.sha256").exists()
 
 
+def written(run, agreed, exported_run, formats):
+    forms, simulation = agreed
+    module.write(run, formats, forms, simulation, metadata_of(exported_run))
+
+
 @pytest.mark.slow
-def test_a_file_for_joints_in_another_order_is_refused_before_it_is_written(copied, monkeypatch):
-    for path in copied.glob("policy.*"):
-        path.unlink()
+def test_a_file_for_joints_in_another_order_is_refused_before_it_is_written(
+    agreed, exported_run, tmp_path, monkeypatch
+):
     described = module.describe.describe_robot
 
     def swapped(*parts):
@@ -167,34 +183,29 @@ def test_a_file_for_joints_in_another_order_is_refused_before_it_is_written(copi
 
     monkeypatch.setattr(module.describe, "describe_robot", swapped)
     with pytest.raises(UserError, match=r"the metadata is wrong: joints is \('joint2', 'joint1'\)"):
-        export_policy(copied, "best", ["torchscript", "onnx"], episodes=8)
-    assert not list(copied.glob("policy.*"))
+        written(tmp_path, agreed, exported_run, ["torchscript", "onnx"])
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.slow
-def test_only_the_asked_form_is_written(copied):
-    for path in copied.glob("policy.*"):
-        path.unlink()
-    export_policy(copied, "last", ["torchscript"], episodes=8)
-    assert sorted(path.name for path in copied.glob("policy*")) == ["policy.pt", "policy.pt.sha256"]
-    assert metadata_of(copied)["checkpoint"]["which"] == "last"
-
-
-@pytest.mark.slow
-def test_each_stage_is_reported(copied):
-    stages = []
-    export_policy(copied, "best", ["onnx"], lambda stage, result: stages.append(f"{stage}: {result}"), episodes=8)
-    text = "\n".join(stages)
-    for part in ("1,024 states", "extremes", "to the last bit", "fresh process", "ONNX Runtime: within", "8 episodes"):
-        assert part in text
-
-
-@pytest.mark.slow
-def test_onnx_metadata_that_are_not_those_of_the_policy_are_refused(copied, monkeypatch):
+def test_onnx_metadata_that_are_not_those_of_the_policy_are_refused(agreed, exported_run, tmp_path, monkeypatch):
     described = module.onnx.describe
     monkeypatch.setattr(module.onnx, "describe", lambda content, text: described(content, text.replace("joint1", "x")))
     with pytest.raises(gate.GateError, match="the metadata of the ONNX file is not that of the policy"):
-        export_policy(copied, "best", ["onnx"], episodes=8)
+        written(tmp_path, agreed, exported_run, ["onnx"])
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.slow
+def test_only_the_asked_form_is_written(agreed, exported_run, tmp_path):
+    written(tmp_path, agreed, exported_run, ["torchscript"])
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["policy.pt", "policy.pt.sha256"]
+
+
+def test_each_stage_is_reported(exported_run):
+    text = (exported_run / "export.txt").read_text()
+    for part in ("1,024 states", "extremes", "to the last bit", "fresh process", "ONNX in ONNX", "drives 200 episodes"):
+        assert part in text
 
 
 @pytest.mark.parametrize("name", ["policy.pt", "policy.onnx"])

@@ -15,7 +15,7 @@ from physai.deploy import load_policy, read_metadata
 from physai.deploy.policy import load_module
 from physai.training.run import TrainedPolicy
 
-COMMAND, SIZE = "joint_velocity_command", 32
+COMMAND, SIZE = "joint_velocity_command", 40  # 32 of the unit, and four actions
 KEYS = ["joint_position", "joint_velocity", "goal", "memory"]
 
 

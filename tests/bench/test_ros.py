@@ -1,17 +1,17 @@
 """The measurement of the ROS 2 node runs, and shows every figure."""
 
+import shutil
+
 import pytest
 from rich.console import Console
 
-from physai.artifact import export
-from physai.bench import policy, ros
+from physai.bench import ros
 from tests.ros.peer import free_domain
 
 
 @pytest.mark.slow
-def test_both_nodes_are_timed_and_shown(monkeypatch):
-    monkeypatch.setattr(policy, "FRAMES", 2048)
-    monkeypatch.setattr(export, "TRANSFER_EPISODES", 8)
+def test_both_nodes_are_timed_and_shown(exported_run, monkeypatch):
+    monkeypatch.setattr(ros, "make_run", lambda run, *_: shutil.copytree(exported_run, run, dirs_exist_ok=True))
     monkeypatch.setattr(ros, "PERIOD_SECONDS", 2.0)
     monkeypatch.setattr(ros, "LATENCY_SECONDS", 1.0)
     monkeypatch.setattr(ros, "STARTS", 1)

@@ -16,6 +16,21 @@ def test_what_nohup_started_goes_on_when_its_terminal_is_closed():
     assert done.stdout == "goes on\n"
 
 
+def test_a_signal_that_a_library_swallows_ends_a_command_all_the_same():
+    """As some do while they are imported: a bare except around an import of what may not be there."""
+    program = (
+        "import os, signal, time; from physai import cli\n"
+        "with cli.guard():\n"
+        "    try: os.kill(os.getpid(), signal.SIGTERM); time.sleep(0.1)\n"
+        "    except: print('swallowed', flush=True)\n"
+        "    try: time.sleep(30)\n"
+        "    finally: time.sleep(1.5); print('in order', flush=True)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60)
+    assert done.returncode == 128 + signal.SIGTERM
+    assert done.stdout == "swallowed\nin order\n"
+
+
 def test_a_reader_that_has_had_enough_ends_a_command_in_silence(tmp_path):
     line = [sys.executable, "-m", "physai.train", "--help"]
     process = subprocess.Popen(line, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)

@@ -6,6 +6,12 @@ from physai.transforms import RunningStatistics
 from tests.collectors import parts
 
 
+@pytest.fixture(autouse=True)
+def one_mode(monkeypatch):
+    """Whether Ray asks for tokens: a process remembers that from its first cluster on, and refuses those of others."""
+    monkeypatch.setenv("RAY_AUTH_MODE", "disabled")
+
+
 @pytest.fixture
 def collect():
     """Make a collector that ends with the test; return it, its policy and the learner's statistics."""

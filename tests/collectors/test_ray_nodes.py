@@ -26,6 +26,7 @@ from tests.training.small import SIZES, assert_same_run, command, undisturbed
 pytest.importorskip("ray")
 pytestmark = [
     pytest.mark.slow,
+    pytest.mark.timeout(600),  # four starts of Ray, two of a training
     pytest.mark.skipif(sys.platform != "linux", reason="a computer is a mount namespace here"),
 ]
 
@@ -120,6 +121,7 @@ def _start(program: list[str], cwd: Path) -> "subprocess.Popen[str]":
 def computers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Computers]:
     monkeypatch.setenv("RAY_AUTH_MODE", "disabled")
     monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
+    monkeypatch.setenv("RAY_worker_niceness", "0")
     with TemporaryDirectory(prefix="ray", ignore_cleanup_errors=True) as short:  # paths of sockets have 107 bytes
         made = Computers(tmp_path, Path(short))
         yield made
@@ -144,5 +146,6 @@ def test_a_run_that_loses_a_computer_ends_in_one_line_and_goes_on_when_it_is_bac
 
     computers.switch_on()
     again = command("train", "resume=lost", *joining, cwd=tmp_path)
-    assert again.wait() == 0, again.communicate()[0]
+    output = again.communicate()[0]
+    assert again.returncode == 0, output
     assert_same_run(tmp_path / "lost", undisturbed(once, "multi_sync"))

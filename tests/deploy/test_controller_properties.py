@@ -53,7 +53,7 @@ def drive(policies, seed, updates, log=None):
     return seen
 
 
-SEEDS, UPDATES = range(2), 126_000  # one with velocities, one with positions
+SEEDS, UPDATES = range(2), 90_000  # one with velocities, one with positions
 
 
 @pytest.mark.slow

@@ -10,7 +10,7 @@ from physai.deploy.metadata import describe_signal
 from physai.signals import Quantity, Signal
 from tests.deploy.files import described, refusal
 
-PERIOD, SIZE = 0.02, 32
+PERIOD, SIZE = 0.02, 40
 GOAL, OTHER_GOAL = Goal([-0.4, -0.1], "base"), Goal([-0.1, -0.4], "base")
 
 
@@ -80,8 +80,8 @@ def golden_nan(metadata):
         (set_size([True]), "inputs.3.shape must be positive integers"),
         (set_size([10**9]), "inputs.3.shape must be positive integers"),
         (set_size([60000, 60000]), "inputs.3 has 3,600,000,000 numbers, more than 65,536"),
-        (set_size(32), "inputs.3.shape must be a list"),
-        (set_size([31]), "golden.memory must have the shape [32, 31], not [32, 32]"),
+        (set_size(40), "inputs.3.shape must be a list"),
+        (set_size([39]), "golden.memory must have the shape [32, 39], not [32, 40]"),
         (forget_the_output, "there is 'memory' among the inputs, and no 'new_memory' among the outputs"),
         (lambda metadata: metadata["inputs"].pop(), "a policy that remembers takes 'memory' and gives as much"),
         (forget_the_memory, "its forward takes ['joint_position', 'joint_velocity', 'goal', 'memory'], not"),
@@ -238,7 +238,7 @@ def test_a_new_goal_begins_a_new_memory_and_the_same_goal_again_does_not(robot):
     [
         (lambda command, memory: (command, memory * math.nan), "the policy gave a memory that is not finite"),
         (lambda command, memory: (command, np.full(SIZE, math.inf)), "the policy gave a memory that is not finite"),
-        (lambda command, memory: (command, memory[:-1]), "the policy gave a memory of the shape [31]"),
+        (lambda command, memory: (command, memory[:-1]), "the policy gave a memory of the shape [39]"),
         (lambda command, memory: (command, None), "the policy gave a memory of the shape []"),
         (lambda command, memory: command, "the policy gave the shape []"),
     ],

@@ -22,6 +22,7 @@ from physai.identify.__main__ import IdentifyConfig
 from physai.play import PlayConfig
 from physai.plot import PlotConfig
 from physai.ros.demo import DemoConfig
+from physai.ros.fleet import FleetConfig
 from physai.ros.topics.commands import controller_topic
 from physai.search.config import SearchConfig
 from physai.signals import Quantity
@@ -43,6 +44,7 @@ COMMANDS = {
     "physai.capsules": ("capsules", CapsulesConfig),
     "physai.plot": ("plot", PlotConfig),
     "physai.ros.demo": ("demo", DemoConfig),
+    "physai.ros.fleet": ("fleet", FleetConfig),
 }
 parameter_class: Callable[[str], Any] = hooks()["parameter_class"]  # type: ignore[assignment]
 
@@ -158,10 +160,15 @@ def _check_ros2(given: Sequence[str]) -> None:
 
 def exists(name: str) -> bool:
     """Whether the code knows a topic or service; those of a node are ``~/name`` there."""
-    node, _, private = name.removeprefix("/").partition("/")
-    if name in (controller_topic(Quantity.JOINT_VELOCITY), controller_topic(Quantity.JOINT_POSITION)):
+    relative = re.sub(r"^/(arm\d+/)?", "", name)
+    node, _, private = relative.partition("/")
+    if relative in (controller_topic(Quantity.JOINT_VELOCITY), controller_topic(Quantity.JOINT_POSITION)):
         return True
-    return f'"{name}"' in SOURCES or (node in hooks()["PARAMETERS"] and f'"~/{private}"' in SOURCES)  # type: ignore[operator]
+    return (
+        f'"{name}"' in SOURCES
+        or f'"{relative}"' in SOURCES
+        or (node in hooks()["PARAMETERS"] and f'"~/{private}"' in SOURCES)
+    )  # type: ignore[operator]
 
 
 def _message(kind: str) -> Any:

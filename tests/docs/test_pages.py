@@ -49,11 +49,11 @@ def test_each_row_of_the_tables_of_faults_has_a_test_that_names_it_and_no_test_n
 def test_each_parameter_is_in_the_table_that_a_page_asks_for(name):
     asked = [path for path in PAGES if f"<!-- parameters: {name} -->" in path.read_text()]
     assert len(asked) == 1
-    table = HOOKS["parameters"](name)
-    if name == "inference_node":
-        table += HOOKS["parameters"]("controller")
+    others = {"inference_node": ("controller",), "excite": ("inference_node", "controller")}.get(name, ())
+    tables = [HOOKS["parameters"](each).splitlines() for each in (name, *others)]
     for field in dataclasses.fields(HOOKS["parameter_class"](name)):
-        (row,) = [line for line in table.splitlines() if line.startswith(f"| `{field.name}`")]
+        found = [[line for line in table if line.startswith(f"| `{field.name}`")] for table in tables]
+        (row,) = next(rows for rows in found if rows)
         assert field.metadata["description"].replace("<", "&lt;") in row
         assert field.metadata["unit"] in row
         assert ("\\*" in row) == field.metadata["fixed"]

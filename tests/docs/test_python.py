@@ -72,6 +72,12 @@ def test_a_policy_that_remembers_is_called_as_shown(recurrent_run, monkeypatch):
     assert len(names["memory"]) == names["policy"].metadata.memory_size > 0
 
 
+@pytest.mark.slow
+def test_the_page_on_watching_draws_two_arms_from_a_policy_file(run):
+    assert "http://127.0.0.1:" in run("docs/live.md")
+
+
 def test_every_page_with_python_is_run():
-    assert {block.page for block in RUN} == {"README.md", "docs/train.md", "docs/deploy.md", "docs/extending.md"}
+    pages = {"README.md", "docs/train.md", "docs/deploy.md", "docs/extending.md", "docs/live.md"}
+    assert {block.page for block in RUN} == pages
     assert all(isinstance(block, Block) for block in RUN)

@@ -200,14 +200,13 @@ def test_the_global_random_numbers_of_torch_play_no_part(make_env):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize("command", COMMANDS)
 @parametrized
-def test_a_restored_state_continues_bit_for_bit_with_noise_and_delay(make_env, name, randomization, command, seed):
+def test_a_restored_state_continues_bit_for_bit_with_noise_and_delay(make_env, name, randomization, command):
     carried_over = "env.start.carried_over=0.5"
     steps = ["env.task.max_steps=40", "env.task.tolerance=0.1", f"env.robot.command={command}", carried_over]
     options = {"overrides": steps}
-    original = make_env(name, randomization, seed=seed, **options)
+    original = make_env(name, randomization, seed=0, **options)
     seen, td = play(original, original.reset(), 45)
     learn(original, seen)
     _, td = play(original, td, 8, seed=1)

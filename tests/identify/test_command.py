@@ -2,12 +2,14 @@
 
 import json
 
+import numpy as np
 import pytest
+import torch
 
+from physai.bench.hidden import NOISE, record, write_table
 from physai.compose import compose
 from physai.config import validate
 from physai.physics import RandomizationConfig
-from tests.identify.hidden import record, write_table
 
 
 @pytest.fixture(scope="module")
@@ -29,13 +31,26 @@ def test_it_shows_and_writes_what_was_found(run, table, hidden):
     assert code == 0, error
     assert "95 % interval" in output
     assert "the noise of the sensors explains them" in output
-    written = json.loads(table.with_name("robot.csv.identified.json").read_text())
+    folder = table.with_name("robot_identified")
+    assert sorted(path.name for path in folder.iterdir()) == [
+        f"identified.{kind}" for kind in ("json", "png", "txt", "yaml")
+    ]
+    assert "95 % interval" in (folder / "identified.txt").read_text()
+    written = json.loads((folder / "identified.json").read_text())
     assert written["actuator_delay"] == hidden.delay
     assert written["explained"]
     for joint, truth in zip(hidden.spec.joints, hidden.parameters[hidden.layout.columns["velocity_gain"]], strict=True):
         found = written["parameters"][f"velocity_gain[{joint}]"]
         assert found["told"]
         assert abs(found["value"] - truth) < 0.02
+    # What it wrote is a randomization to train with, from whichever folder.
+    node = compose("train", [f"randomization={folder}/identified.yaml"])
+    draws = validate(RandomizationConfig, node.randomization)
+    drawn = draws.sample(100, hidden.layout, torch.Generator().manual_seed(0)).numpy()
+    columns = hidden.layout.columns["velocity_gain"]
+    assert (np.abs(drawn[:, columns] - hidden.parameters[columns]) < 0.05).all()
+    assert (drawn[:, hidden.layout.columns["actuator_delay"]] == hidden.delay).all()
+    np.testing.assert_allclose(drawn[:, hidden.layout.columns["position_noise"]].mean(), NOISE[0], rtol=0.25)
 
 
 @pytest.mark.parametrize(
@@ -44,8 +59,12 @@ def test_it_shows_and_writes_what_was_found(run, table, hidden):
         (["data=nowhere.csv"], "nowhere.csv: No such file or directory"),
         (["data=robot.csv", "fit=[link_mas]"], "fit: 'link_mas' is none of link_mass, payload"),
         (["data=robot.csv", "fit=[]"], "fit: "),
+        (
+            ["data=robot.csv", "fit=[link_mass,effort_limit]"],
+            "fit: effort_limit does not show in robot.csv, which has no",
+        ),
         (["data=robot.csv", "env=kuka_reacher"], "robot.csv: it has no column 'position[lbr_iiwa_joint_1]'"),
-        (["data=robot.csv", "output=found.txt"], "output: 'found.txt' must end in .json"),
+        (["data=robot.csv", "output=robot.csv"], "output: robot.csv is no folder"),
         (["data=robot.csv", "delays=-1"], "delays: "),
         (["fit=[link_mass]"], "data"),
     ],

@@ -1,17 +1,18 @@
 """What is found of hidden robots, and what is said of what cannot be."""
 
+import dataclasses
 from contextlib import closing
 
 import numpy as np
 import pytest
 
+from physai.bench.hidden import NOISE, record
 from physai.compose import compose
 from physai.config import validate
 from physai.identify.fit import Predictor, fit
 from physai.identify.trials import cut
 from physai.identify.unknowns import Unknowns
 from physai.physics import RandomizationConfig
-from tests.identify.hidden import NOISE, record
 
 ALL = ["link_mass", "payload", "joint_damping", "joint_friction", "velocity_gain"]
 
@@ -21,11 +22,11 @@ def strong():
     return validate(RandomizationConfig, compose("train", ["randomization=strong"]).randomization)
 
 
-def found(hidden, physics, names, delays=range(5)):
+def found(hidden, physics, names, longest=4):
     trials = cut(hidden.recording, "robot", hidden.spec.joints)
     unknowns = Unknowns.of(names, hidden.spec, hidden.layout)
-    with closing(Predictor(hidden.spec, physics, hidden.recording.control_dt, trials)) as predict:
-        return fit(predict, trials, unknowns, delays, 0, lambda _: None)
+    with closing(Predictor(hidden.spec, physics, hidden.recording.period, trials)) as predict:
+        return fit(predict, trials, unknowns, longest, 0, lambda _: None)
 
 
 @pytest.mark.slow
@@ -66,7 +67,42 @@ def test_a_parameter_that_shows_in_no_motion_is_not_given_a_number(env_config, s
     """A joint that turns without end about a vertical axis moves alike wherever its encoder's zero is."""
     config = env_config("reacher", "physics=mujoco")
     hidden = record(config, strong, ["encoder_offset"], 10.0, 1)
-    result = found(hidden, config.physics, ["encoder_offset", "velocity_gain"], range(hidden.delay, hidden.delay + 1))
+    result = found(hidden, config.physics, ["encoder_offset", "velocity_gain"])
     of = dict(zip(result.unknowns.labels, result.unseen, strict=True))
     assert of["encoder_offset[joint1]"]
     assert not of["velocity_gain[joint1]"]
+
+
+@pytest.mark.slow
+def test_with_efforts_the_scale_of_masses_and_effort_limits_is_found(env_config, strong):
+    """Without them it is refused: with twice the masses, damping, friction and effort a robot moves alike.
+
+    Both motors of this robot reach their limits, which are far below those of the description.
+    """
+    config = env_config("reacher", "physics=mujoco")
+    names = [*ALL, "effort_limit"]
+    hidden = record(config, strong, names, 20.0, 2, feels=True)
+    result = found(hidden, config.physics, names)
+    truth = hidden.parameters[result.unknowns.columns]
+    wrong = dict(zip(result.unknowns.labels, np.abs(result.values / np.maximum(truth, 1e-9) - 1), strict=True))
+    sure = ("link_mass[link1]", "link_mass[link2]", "effort_limit[joint1]", "effort_limit[joint2]")
+    assert max(wrong[label] for label in sure) < 0.08
+    assert result.explained
+
+
+@pytest.mark.slow
+def test_motions_in_which_commands_came_late_are_left_out_and_named(env_config, strong):
+    config = env_config("reacher", "physics=mujoco")
+    hidden = record(config, strong, ["velocity_gain"], 20.0, 2)
+    recording = hidden.recording
+    trials = cut(recording, "robot", hidden.spec.joints)
+    first = round(trials.begins[1] / recording.period)
+    command = recording.command.copy()
+    command[first : first + 60] = recording.command[first + 6 : first + 66]  # it is said that they came sooner
+    spoilt = dataclasses.replace(hidden, recording=dataclasses.replace(recording, command=command))
+    result = found(spoilt, config.physics, ["velocity_gain", "joint_damping"])
+    assert result.spoilt == (1,)
+    assert result.delay == hidden.delay
+    assert result.explained
+    truth = hidden.parameters[hidden.layout.columns["velocity_gain"]]
+    np.testing.assert_allclose(result.values[:2], truth, atol=0.02)

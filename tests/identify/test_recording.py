@@ -5,13 +5,13 @@ import dataclasses
 import numpy as np
 import pytest
 
+from physai.bench.hidden import record, write_table
 from physai.compose import compose
 from physai.config import validate
 from physai.errors import UserError
-from physai.identify.recording import Recording, read
+from physai.identify.recording import Recording, _on_grid, read
 from physai.identify.trials import cut
 from physai.physics import RandomizationConfig
-from tests.identify.hidden import record, write_table
 
 TOPIC = "/joint_velocity_controller/commands"
 
@@ -19,7 +19,7 @@ TOPIC = "/joint_velocity_controller/commands"
 @pytest.fixture(scope="module")
 def hidden(env_config):
     draws = validate(RandomizationConfig, compose("train", ["randomization=none"]).randomization)
-    return record(env_config("reacher", "physics=mujoco"), draws, [], 12.0, 0)
+    return record(env_config("reacher", "physics=mujoco"), draws, [], 12.0, 0, feels=True)
 
 
 @pytest.fixture
@@ -35,7 +35,7 @@ def read_table(path):
 
 def test_a_table_says_what_was_recorded(hidden, table):
     seen = read_table(table)
-    for key in ("position", "velocity", "command"):
+    for key in ("position", "velocity", "command", "effort"):
         np.testing.assert_allclose(getattr(seen, key), getattr(hidden.recording, key), rtol=0, atol=1e-7)
 
 
@@ -48,7 +48,7 @@ def test_a_table_says_what_was_recorded(hidden, table):
         (lambda text: text.replace("\n4,", "\n1,"), "the clock of its joint states goes back by 2.98 s at number 200"),
         (lambda text: text.replace("\n4,", "\n4000,"), "goes on by 4e+03 s at number 200"),
         (lambda text: text.replace("\n4,", "\n,"), "a time of its joint states is not finite"),
-        (lambda text: "\n".join(text.split("\n")[::2]), "come every 40 ms, and the control period of the env is 20 ms"),
+        (lambda text: "\n".join(text.split("\n")[::2]), "every 40 ms, and the control period of the env is only 20 ms"),
         (lambda text: text.split("\n")[0], "it holds 0 joint states"),
         (lambda _: "", "No columns to parse"),
     ],
@@ -59,6 +59,20 @@ def test_a_spoilt_table_is_refused_in_one_line(table, spoil, line):
         read_table(table)
     assert line in str(caught.value)
     assert len(str(caught.value).splitlines()) == 1
+
+
+@pytest.mark.parametrize(("parts", "period"), [(2, 0.01), (4, 0.005), (20, 0.005), (2.5, 0.008)])
+def test_joint_states_that_come_faster_than_commands_make_finer_steps(tmp_path, parts, period):
+    count = int(200 * parts)
+    time = 0.02 / parts * np.arange(count)[:, None]
+    position, command = np.hstack([np.sin(time), np.cos(time)]), np.floor(time / 0.02 + 1e-9)
+    fast = Recording(0.02 / parts, position, np.zeros((count, 2)), np.hstack([command, -command]), np.zeros((count, 2)))
+    write_table(fast, ("joint1", "joint2"), tmp_path / "fast.csv")
+    seen = read_table(tmp_path / "fast.csv")
+    assert seen.period == pytest.approx(period)
+    grid = period * np.arange(len(seen))
+    np.testing.assert_allclose(seen.position[:, 0], np.sin(grid), rtol=0, atol=1e-6)
+    assert np.isfinite(seen.command).all()
 
 
 def test_with_lost_rows_their_commands_are_lost_and_the_rest_is_as_it_was(hidden, table):
@@ -77,7 +91,7 @@ def test_motions_begin_where_commands_change_after_a_rest(hidden):
     assert len(trials) >= 3
     assert not trials.before.any()
     assert trials.command[0].any(axis=1).all()
-    np.testing.assert_allclose(trials.noise, [1e-3, 2e-2], rtol=0.25)
+    np.testing.assert_allclose(trials.noise[:2], [[1e-3] * 2, [2e-2] * 2], rtol=0.25)
     assert np.isfinite(trials.measured).any(axis=(0, 1, 3)).all()
 
 
@@ -88,7 +102,7 @@ def test_who_moves_steadily_does_not_rest(hidden):
     first = int(np.flatnonzero(command.any(axis=1))[0])
     whole = cut(recording, "robot", hidden.spec.joints)
     command[:first] = 0.5
-    position[:first] -= 0.5 * recording.control_dt * np.arange(first, 0, -1)[:, None]
+    position[:first] -= 0.5 * recording.period * np.arange(first, 0, -1)[:, None]
     steady = cut(dataclasses.replace(recording, command=command, position=position), "robot", hidden.spec.joints)
     assert len(steady) == len(whole) - 1
     assert steady.left_out == (f"at {first * 0.02:.2f} s: the robot still moves when it begins",)
@@ -106,7 +120,9 @@ def test_a_motion_ends_where_a_command_is_not_known_and_it_is_said(hidden):
 
 
 def test_of_a_long_recording_motions_from_all_over_it_are_used(hidden):
-    again = {key: np.tile(getattr(hidden.recording, key), (15, 1)) for key in ("position", "velocity", "command")}
+    again = {
+        key: np.tile(getattr(hidden.recording, key), (15, 1)) for key in ("position", "velocity", "command", "effort")
+    }
     trials = cut(dataclasses.replace(hidden.recording, **again), "robot", hidden.spec.joints)
     assert len(trials) == 40
     assert "all but 40 of" in trials.left_out[-1]
@@ -123,7 +139,11 @@ def test_motions_that_tell_nothing_are_refused_in_one_line(hidden, change, line)
     recording = hidden.recording
     command, position = change(recording.command, recording.position)
     with pytest.raises(UserError, match=line) as caught:
-        cut(Recording(recording.control_dt, position, recording.velocity, command), "robot", hidden.spec.joints)
+        cut(
+            Recording(recording.period, position, recording.velocity, command, recording.effort),
+            "robot",
+            hidden.spec.joints,
+        )
     assert len(str(caught.value).splitlines()) == 1
 
 
@@ -136,21 +156,30 @@ def test_a_recording_of_topics_says_the_same_as_a_table(hidden, tmp_path):
         bag.add(topic, kind)
     header = types["std_msgs/msg/Header"](types["builtin_interfaces/msg/Time"](0, 0), "")
     layout = types["std_msgs/msg/MultiArrayLayout"]([], 0)
-    nothing = np.empty(0)
     random = np.random.default_rng(0)
     for step in range(len(recording)):
         at = round((100.0 + 0.02 * step + random.uniform(0.0, 0.002)) * 1e9)
         # The driver has more joints, in another order.
-        position, velocity = (np.append(values[step][::-1], 7.0) for values in (recording.position, recording.velocity))
-        states = types[kinds["/joint_states"]](header, ["joint2", "joint1", "finger"], position, velocity, nothing)
+        measured = (recording.position, recording.velocity, recording.effort)
+        position, velocity, effort = (np.append(values[step][::-1], 7.0) for values in measured)
+        states = types[kinds["/joint_states"]](header, ["joint2", "joint1", "finger"], position, velocity, effort)
         command = types[kinds[TOPIC]](layout, recording.command[step])
         for topic, late, message in (("/joint_states", 0, states), (TOPIC, 1_000_000, command)):
             bag.write(topic, kinds[topic], at + late, bytes(bags.TYPES.serialize_cdr(message, kinds[topic])))
     bag.close()
     seen = read_table(tmp_path / "bag")
-    for key in ("position", "velocity", "command"):
+    for key in ("position", "velocity", "command", "effort"):
         np.testing.assert_allclose(getattr(seen, key), getattr(recording, key), rtol=0, atol=1e-7)
     with pytest.raises(UserError, match="has no joint 'elbow'"):
         read(tmp_path / "bag", ("joint1", "elbow"), 0.02, TOPIC)
     with pytest.raises(UserError, match="it holds no /other"):
         read(tmp_path / "bag", ("joint1", "joint2"), 0.02, "/other")
+
+
+def test_states_that_come_in_a_burst_at_the_start_leave_the_last_command_as_it_is(tmp_path):
+    time = np.concatenate([[0.0, 0.001, 0.002], 0.02 * np.arange(1, 101)])  # a driver that was late with its first ones
+    states = np.column_stack([time, np.zeros((len(time), 6))])
+    commands = np.column_stack([0.011 + 0.02 * np.arange(100), np.full((100, 2), 0.5)])
+    seen = _on_grid(tmp_path, states, commands, 0.02)
+    assert len(seen) == 101
+    assert (seen.command[1:] == 0.5).all()

@@ -14,9 +14,9 @@ from tests.physics.moving import DT
 
 
 @pytest.fixture(scope="module")
-def spec(any_robot: EnvConfig) -> RobotSpec:
-    """Each robot in turn."""
-    return RobotSpec.from_config(any_robot.robot)
+def spec(any_arm: EnvConfig) -> RobotSpec:
+    """Each robot whose base is fixed, in turn."""
+    return RobotSpec.from_config(any_arm.robot)
 
 
 @pytest.fixture(scope="module")

@@ -19,7 +19,7 @@ def test_a_joint_reaches_its_target_or_its_motor_gives_all_that_it_has(joints):
     mass, free, target = problem(random, 200, joints)
     limit = random.uniform(0.1, 5, target.shape)
     none = np.full_like(target, np.inf)
-    velocity = motor_velocity(mass, free, target, limit, -none, none)
+    velocity = motor_velocity(mass, free, target, limit, -none, none)[0]
     impulse = np.einsum("nij,nj->ni", mass, velocity - free)
     assert (np.abs(impulse) <= limit * (1 + 1e-9)).all()
     missing = target - velocity
@@ -36,9 +36,9 @@ def test_a_limit_holds_against_any_motor_and_only_pushes_away_from_itself():
     target = np.array([[1.0, -2.0], [1.0, 2.0], [1.0, -2.0]])
     lower, upper = np.full((3, 2), -np.inf), np.full((3, 2), np.inf)
     lower[:2, 1] = 0.3
-    velocity = motor_velocity(mass, free, target, strong, lower, upper)
+    velocity = motor_velocity(mass, free, target, strong, lower, upper)[0]
     np.testing.assert_allclose(velocity, [[1.0, 0.3], [1.0, 2.0], [1.0, -2.0]], atol=1e-9)
-    weak = motor_velocity(mass, np.full((3, 2), -5.0), target, np.full((3, 2), 0.1), lower, upper)
+    weak = motor_velocity(mass, np.full((3, 2), -5.0), target, np.full((3, 2), 0.1), lower, upper)[0]
     np.testing.assert_allclose(weak[:2, 1], 0.3, atol=1e-9)
     assert (weak[2] < -4).all()
 
@@ -53,8 +53,8 @@ def test_a_robot_among_others_gets_the_same_bits_as_alone(joints):
     random = np.random.default_rng(0)
     mass, free, target = problem(random, 100, joints)
     limit, none = random.uniform(0.1, 5, target.shape), np.full_like(target, np.inf)
-    together = motor_velocity(mass, free, target, limit, -none, none)
+    together = motor_velocity(mass, free, target, limit, -none, none)[0]
     for row in range(0, 100, 7):
         one = slice(row, row + 1)
-        alone = motor_velocity(mass[one], free[one], target[one], limit[one], -none[one], none[one])
+        alone = motor_velocity(mass[one], free[one], target[one], limit[one], -none[one], none[one])[0]
         np.testing.assert_array_equal(alone, together[one])

@@ -1,9 +1,14 @@
-"""A randomization that changes nothing is found out. (What is drawn: tests/transforms/test_randomization.py.)"""
+"""A randomization that changes nothing, or is another robot's, is found out.
+
+What is drawn: tests/transforms/test_randomization.py.
+"""
 
 import pytest
+import torch
 
 from physai.compose import compose
 from physai.config import validate
+from physai.errors import UserError
 from physai.physics import ParameterLayout, RandomizationConfig
 from physai.robots import RobotSpec
 
@@ -53,3 +58,36 @@ def test_a_scale_counts_when_a_single_joint_has_something_to_scale(planar):
     half = ParameterLayout(planar)
     half.nominal[half.columns["joint_damping"]] *= half.nominal.new_tensor([0.0, 1.0])
     assert drawn("joint_damping", "scale").without_effect(half) == []
+
+
+def of_columns(low, high):
+    return config(
+        "randomization=none", f"randomization.link_mass={{distribution:uniform,low:{low},high:{high},operation:set}}"
+    )
+
+
+def test_each_column_may_have_a_range_of_its_own(layout):
+    draws = of_columns([1.0, 2.0, 0.1], [1.5, 2.0, 0.2])
+    draws.check(layout)
+    mass = draws.sample(500, layout, torch.Generator().manual_seed(0))[:, layout.columns["link_mass"]]
+    low, high = mass.min(dim=0).values, mass.max(dim=0).values
+    torch.testing.assert_close(low, torch.tensor([1.0, 2.0, 0.1]), rtol=0, atol=5e-3)
+    torch.testing.assert_close(high, torch.tensor([1.5, 2.0, 0.2]), rtol=0, atol=5e-3)
+
+
+def test_ranges_of_a_robot_with_other_links_are_refused(layout):
+    with pytest.raises(UserError, match=r"link_mass: 2 values, and there are link_mass\[link1\], link_mass\[link2\], "):
+        of_columns([1.0, 2.0], [1.0, 2.0]).check(layout)
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "line"),
+    [
+        ([1.0, 2.0, 0.1], [1.0, 1.9, 0.1], "is above"),
+        ([1.0, 2.0], [1.0, 2.0, 3.0], "as many values"),
+        (1.0, [1.0, 2.0, 3.0], "as many values"),
+    ],
+)
+def test_ranges_that_are_none_are_refused(low, high, line):
+    with pytest.raises(UserError, match=line):
+        of_columns(low, high)

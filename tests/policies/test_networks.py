@@ -54,6 +54,16 @@ def test_an_untrained_residual_actor_does_what_is_suggested():
     assert torch.equal(torch.jit.script(actor.deterministic())(seen), data["action"])
 
 
+def test_a_residual_actor_adds_the_share_that_it_is_told_of_what_its_network_makes():
+    torch.manual_seed(0)
+    whole = ResidualActor(5, 2, ["x", "features"], [8], "torch.nn.Tanh", initial_std=0.3)
+    tenth = ResidualActor(5, 2, ["x", "features"], [8], "torch.nn.Tanh", initial_std=0.3, scale=0.1)
+    tenth.load_state_dict(whole.state_dict())
+    data = TensorDict({"x": torch.randn(64, 1), "features": torch.randn(64, 4)}, [64])
+    added = [actor.mean(data) - data["features"][:, 2:] for actor in (whole, tenth)]
+    torch.testing.assert_close(added[1], 0.1 * added[0])
+
+
 def test_a_residual_actor_must_see_the_features_last():
     with pytest.raises(UserError, match=r"policy\.actor\.in_keys: the last must be features"):
         ResidualActor(5, 2, ["features", "x"], [8], "torch.nn.Tanh", initial_std=0.3)

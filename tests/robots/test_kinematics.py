@@ -21,8 +21,8 @@ SEVEN = [f"lbr_iiwa_joint_{number}" for number in range(1, 8)]
 
 
 @pytest.fixture(scope="module")
-def spec(any_robot):
-    return RobotSpec.from_config(any_robot.robot)
+def spec(any_arm):
+    return RobotSpec.from_config(any_arm.robot)
 
 
 def first_joints(config: RobotConfig, joints: int) -> RobotSpec:
@@ -141,8 +141,11 @@ def test_any_chain_of_turned_joints_matches_pybullet(tmp_path, seed):
         end_effector="l7",
         home=[0.0] * 3,
         command="joint_velocity",
+        action="speed",
         command_limit=[1.0] * 3,
         position_gain=20.0,
+        servo=None,
+        floating=None,
         damping=None,
         friction=None,
         gravity=[0.0, 0.0, -9.81],

@@ -23,17 +23,25 @@ from tests.ros.peer import SHM, Peer, Process, free_domain, node_command, remove
 from tests.ros.stalls import Stalls
 
 ATTEMPTS = 3
+# What fails once in five hundred tests is no news of a node, on a machine that others share; more of it is.
+UNEXPLAINED = 3
 STALLS = pytest.StashKey[Stalls]()
 REPEATED = pytest.StashKey[list[str]]()
+EXCUSES = pytest.StashKey[int]()
 
 
 def pytest_configure(config: pytest.Config) -> None:
     config.stash[REPEATED] = []
+    config.stash[EXCUSES] = UNEXPLAINED
 
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_protocol(item: pytest.Item, nextitem: pytest.Item | None) -> bool | None:
-    """Repeat a test that failed while the machine stood still: how soon a node answers says nothing of it then."""
+    """Repeat a test that failed while the machine stood still: how soon a node answers says nothing of it then.
+
+    A few of a session are repeated once without such an excuse: a core that others use for 10 ms, again and again,
+    is not seen to stand still. All that is repeated is named at the end.
+    """
     if not item.path.is_relative_to(Path(__file__).parent):
         return None
     if STALLS not in item.config.stash:
@@ -43,13 +51,17 @@ def pytest_runtest_protocol(item: pytest.Item, nextitem: pytest.Item | None) -> 
         began = time.monotonic()
         item.ihook.pytest_runtest_logstart(nodeid=item.nodeid, location=item.location)
         reports = runtestprotocol(item, nextitem=nextitem, log=False)
-        failed = any(report.failed for report in reports)
-        stall = item.config.stash[STALLS].longest(since=began) if failed and attempt < ATTEMPTS else 0.0
-        if stall == 0.0:
+        if attempt == ATTEMPTS or not any(report.failed for report in reports):
             break
+        stall = item.config.stash[STALLS].longest(since=began)
+        if stall == 0.0:
+            if attempt > 1 or item.config.stash[EXCUSES] == 0:
+                break
+            item.config.stash[EXCUSES] -= 1
         crash = next(getattr(report.longrepr, "reprcrash", report.longrepr) for report in reports if report.failed)
         reason = str(getattr(crash, "message", crash)).splitlines()[0]
-        item.config.stash[REPEATED].append(f"{item.nodeid}: {reason}, and a stall of {stall:.2f} s")
+        excuse = f"a stall of {stall:.2f} s" if stall else "NO stall was seen"
+        item.config.stash[REPEATED].append(f"{item.nodeid}: {reason}, and {excuse}")
         item._initrequest()  # fixtures of its own
     for report in reports:
         item.ihook.pytest_runtest_logreport(report=report)
@@ -69,7 +81,7 @@ def pytest_testnodedown(node: Any, error: Any) -> None:
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:
     if config.stash[REPEATED]:
-        terminalreporter.section("repeated: the machine stood still")
+        terminalreporter.section("repeated, for they failed at first")
         for line in config.stash[REPEATED]:
             terminalreporter.line(line)
 

@@ -21,6 +21,8 @@ from typing import Any
 from physai.processes import die_with
 from tests.ros.peer import Process, node_command, wait_for
 
+NODES = ("inference_node", "virtual_robot", "record", "command_watchdog", "excite")
+
 
 class Forge:
     """The forking process, as the tests see it."""
@@ -169,7 +171,7 @@ def _import() -> None:
     """What nodes need; PyBullet prints a line, of which neither the tests nor each node shall hear."""
     stdout = os.dup(1)
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
-    nodes = (f"physai.ros.{node}" for node in ("inference_node", "virtual_robot", "record", "command_watchdog"))
+    nodes = (f"physai.ros.{node}" for node in NODES)
     for module in (*nodes, "physai.physics.pybullet"):  # a virtual robot's engine, which it imports by its name
         importlib.import_module(module)
     ctypes.CDLL(None).fflush(None)

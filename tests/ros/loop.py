@@ -69,8 +69,8 @@ class Arm:
 
     def leave(self) -> None:
         """Neither tell nor hear anything any more."""
-        self._peer.node.destroy_timer(self._timer)
-        self._peer.node.destroy_publisher(self._publisher)
+        self._peer.remove(self._timer)
+        self._peer.remove(self._publisher)
 
 
 class Loop:

@@ -23,8 +23,11 @@ from rclpy.duration import Duration
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
+from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
 from rclpy.signals import SignalHandlerOptions
+from rclpy.subscription import Subscription
+from rclpy.timer import Timer
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool, Float64MultiArray, String
 from std_srvs.srv import SetBool, Trigger
@@ -36,7 +39,7 @@ from physai.signals import Quantity
 
 SHM = Path("/dev/shm")
 
-TOPIC = controller_topic(Quantity.JOINT_VELOCITY)
+TOPIC = f"/{controller_topic(Quantity.JOINT_VELOCITY)}"
 
 
 def wait_for(condition: Callable[[], Any], timeout: float = 20.0, what: str | Callable[[], str] = "") -> Any:
@@ -121,6 +124,9 @@ class Process:
 
 def node_command(module: str, *args: str, **parameters: Any) -> list[str]:
     """Command line of a node: parameters by name, everything else as it stands after --ros-args."""
+    if module == "inference_node":
+        # On a machine that is busy with tests a policy may well take 10 ms three times in a row, which is a fault.
+        parameters = {"policy_timeout": 0.1, **parameters}
     command = [sys.executable, "-m", f"physai.ros.{module}", "--ros-args"]
     for name, value in parameters.items():
         text = str(value).lower() if isinstance(value, bool) else str(value)
@@ -161,8 +167,13 @@ class Peer:
         self._thread.start()
 
     def _spin(self) -> None:
-        with contextlib.suppress(ExternalShutdownException):
+        try:
             self._executor.spin()
+        except ExternalShutdownException:
+            pass
+        except RuntimeError:  # RCLError: the context ended while it began to wait
+            if self._context.ok():
+                raise
 
     def listen(
         self,
@@ -176,6 +187,12 @@ class Peer:
         return self.node.create_subscription(
             kind, topic, lambda message: into.append((time.monotonic(), read(message))), profile
         )
+
+    def remove(self, entity: Publisher | Subscription | Timer) -> None:
+        """Destroy it in the thread that spins: in another one, the executor may just be about to wait for it."""
+        name = f"destroy_{type(entity).__name__.lower()}"  # of a Publisher, a Subscription, a Timer
+        task = self._executor.create_task(getattr(self.node, name), entity)
+        wait_for(task.done, what=f"the end of {entity}")
 
     def publisher(self, kind: type, topic: str, profile: QoSProfile | int = 10) -> Any:
         key = (kind, topic, str(profile))

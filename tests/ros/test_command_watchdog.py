@@ -98,7 +98,7 @@ def test_who_commands_the_watchdog_may_stand_by_to_command_the_controller(watchd
         send(watchdog, 0.1, 0.2)
         time.sleep(0.02)
     assert watchdog.commands[-1][1] == [0.1, 0.2]
-    watchdog.node.destroy_publisher(standby)
+    watchdog.remove(standby)
     assert watchdog.call("/command_watchdog/reset").success
 
 
@@ -179,7 +179,7 @@ def test_without_a_controller_it_listens_to_nobody():
             assert publisher.get_subscription_count() == 0
             controller = peer.node.create_subscription(Float64MultiArray, TOPIC, lambda _: None, 1)
             wait_for(publisher.get_subscription_count, what="a watchdog that listens")
-            peer.node.destroy_subscription(controller)
+            peer.remove(controller)
             wait_for(lambda: not publisher.get_subscription_count(), what="a watchdog that listens no more")
         finally:
             process.end()

@@ -7,7 +7,7 @@ import pytest
 
 from physai.deploy import load_policy
 from tests.ros.forge import forged
-from tests.ros.peer import Process
+from tests.ros.peer import Process, wait_for
 
 
 def reach(run: Path, goal: list[float], domain: int) -> None:
@@ -17,7 +17,8 @@ def reach(run: Path, goal: list[float], domain: int) -> None:
     node = forged("inference_node", domain, policy_path=run / "policy.pt", autostart=True, goal=goal)
     robot = Process([sys.executable, str(Path(__file__).with_name("dds_peer.py")), str(domain), *places], domain)
     try:
-        assert robot.wait(60) == 0, robot.output
+        wait_for(lambda: robot.poll() is not None, 60.0, lambda: f"{robot.output}\n{node.output}")
+        assert robot.wait() == 0, robot.output
         assert "rclpy" not in robot.output
         said = [line.split()[-1] for line in robot.lines if line.startswith("the node says")]
         assert said[-2:] == ["active", "reached"]

@@ -98,7 +98,8 @@ def test_with_the_joint_state_as_trigger_commands_answer_states(policy_path):
         loop.peer.moved(after=since, commands=160)
         commands = [at for at, _ in loop.peer.commands if at > since]
         states = [at for at in loop.arm.sent if since < at < commands[-1]]
-        assert abs(len(commands) - len(states)) <= 5  # one for one, but for what is under way
+        # One for one, but for what is under way, and for states that came while the node still worked on one.
+        assert 0.75 * len(states) < len(commands) <= len(states) + 5
         answers = [next((at for at in commands if at > sent), math.inf) - sent for sent in states[:-1]]
         assert statistics.median(answers) < 0.02
         for _ in range(3):

@@ -176,7 +176,7 @@ def test_a_false_does_not_take_away_the_true_of_another_button(peer):
     topic._take_latched(Bool(data=True), {"publication_sequence_number": 2})
     topic._take_latched(Bool(data=False), {"publication_sequence_number": 3})
     assert "is still true" in topic.held()
-    peer.node.destroy_publisher(other)
+    peer.remove(other)
 
 
 def test_without_numbers_a_true_holds_until_all_are_asked_again(peer):

@@ -57,6 +57,13 @@ def test_reordered_names_keep_their_values():
     assert len({tuple(s.names) for s in found}) == 6  # all orders
 
 
+def test_efforts_are_reordered_with_their_names():
+    faults = Faults(FaultConfig(fault_reorder=True), 0)
+    for i in range(20):
+        (found,) = faults.apply(replace(state(i), effort=[7.0, 8.0, 9.0]), i * 0.01)
+        assert dict(zip(found.names, found.effort, strict=True)) == {"a": 7.0, "b": 8.0, "c": 9.0}
+
+
 def test_velocities_can_be_left_out():
     assert sent(Faults(FaultConfig(fault_empty_velocity=True), 0), 1) == [replace(state(0), velocity=[])]
 

@@ -17,7 +17,7 @@ GOAL = list(FAR)
 def rival(peer):
     """A publisher of commands that says nothing; ``rival.leave()``."""
     publisher = peer.node.create_publisher(Float64MultiArray, TOPIC, 1)
-    publisher.leave = lambda: peer.node.destroy_publisher(publisher)
+    publisher.leave = lambda: peer.remove(publisher)
     return publisher
 
 
@@ -47,7 +47,7 @@ def test_another_commander_that_appears_ends_the_motion_for_good(loop):
     loop.peer.all_zeros(after=since + loop.peer.first_zeros(after=since) - 1e-6)
     assert time.monotonic() - created < 2.0
     waits_because_of(loop, f"another publisher commands {TOPIC}: peer")
-    loop.peer.node.destroy_publisher(rival)
+    loop.peer.remove(rival)
     since = time.monotonic()
     waits_because_of(loop, "no goal yet")
     loop.peer.all_zeros(after=since, commands=40)
@@ -63,7 +63,7 @@ def test_a_goal_sent_while_another_one_commands_is_not_kept(loop):
     loop.peer.send_goal(*FAR)
     time.sleep(0.1)
     since = time.monotonic()
-    loop.peer.node.destroy_publisher(rival)
+    loop.peer.remove(rival)
     waits_because_of(loop, "no goal yet")
     loop.peer.all_zeros(after=since, commands=20)
 
@@ -77,7 +77,7 @@ def test_to_disable_it_leaves_zeros_also_when_another_one_has_just_come(loop):
         assert loop.peer.enable(False).success
         loop.peer.silent()
         assert loop.peer.commands[-1][1] == [0.0, 0.0]
-        loop.peer.node.destroy_publisher(rival)
+        loop.peer.remove(rival)
         wait_for(lambda: loop.peer.enable().success, what="permission to move")
 
 
@@ -116,7 +116,7 @@ def test_a_controller_that_leaves_and_returns_stops_the_arm_in_between(policy_pa
                 for _ in range(2):
                     listener = listen()
                     peer.moved(after=time.monotonic())
-                    peer.node.destroy_subscription(listener)
+                    peer.remove(listener)
                     waits_because_of(loop, f"no controller listens to {TOPIC}")
                 # One that was away for longer may have been switched off, and the arm led elsewhere.
                 peer.set_parameters("/inference_node", resume_timeout=0.5)

@@ -250,7 +250,7 @@ def gripper(loop, rate):
     finally:
         leave.set()
         thread.join()
-        loop.peer.node.destroy_publisher(publisher)
+        loop.peer.remove(publisher)
 
 
 @pytest.mark.slow
@@ -286,7 +286,8 @@ def test_with_every_joint_in_a_message_of_its_own_lead_to_the_goals(policy_path)
             loop.peer.send_goal(0.4 * math.cos(angle), 0.4 * math.sin(angle))
             loop.peer.wait_state("active", after=since)
             loop.peer.wait_state("reached", after=since)
-        assert "count: holds: state old" not in loop.diagnosis()[2]
+        # A stall of the computer may make one; a joint that is taken for old makes one in each period.
+        assert int(loop.diagnosis()[2].get("count: holds: state old", 0)) <= 1
 
 
 @pytest.mark.slow

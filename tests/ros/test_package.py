@@ -20,10 +20,14 @@ import pytest
 import tomllib
 import yaml
 from hatchling.builders.wheel import WheelBuilder
+from std_msgs.msg import String
 
 from physai.ros.command_watchdog import WatchdogConfig
+from physai.ros.dashboard import DashboardConfig
+from physai.ros.foxglove import FoxgloveConfig
 from physai.ros.inference_node import InferenceConfig
 from physai.ros.record import RecordConfig
+from physai.ros.topics import qos
 from physai.ros.virtual_robot import VirtualRobotConfig
 from tests.ros.peer import TOPIC, wait_for
 
@@ -34,8 +38,10 @@ NODES = {  # node: its executable, and its parameters
     "command_watchdog": ("command_watchdog", WatchdogConfig),
     "virtual_robot": ("virtual_robot", VirtualRobotConfig),
     "recorder": ("record", RecordConfig),
+    "foxglove": ("foxglove", FoxgloveConfig),
+    "dashboard": ("dashboard", DashboardConfig),
 }
-EXECUTABLES = sorted(executable for executable, _ in NODES.values())
+EXECUTABLES = sorted(["excite", *(executable for executable, _ in NODES.values())])  # which is an inference_node
 
 
 def config_text() -> str:
@@ -44,7 +50,7 @@ def config_text() -> str:
         "# Every parameter of every node, with its default; fixed ones keep their value while a node runs.",
     ]
     for node, (_, kind) in NODES.items():
-        lines += [f"{node}:", "  ros__parameters:"]
+        lines += [f"/**/{node}:  # in any namespace", "  ros__parameters:"]
         for field in dataclasses.fields(kind):
             unit, low, high, choices = (field.metadata[key] for key in ("unit", "low", "high", "choices"))
             extent = " or ".join(choices)
@@ -66,7 +72,7 @@ def test_the_config_file_is_what_the_nodes_have():
     """After a change of parameters: python -m tests.ros.test_package."""
     assert (PACKAGE / "config" / "physai.yaml").read_text() == config_text()
     for node, (_, kind) in NODES.items():
-        values = yaml.safe_load(config_text())[node]["ros__parameters"]
+        values = yaml.safe_load(config_text())[f"/**/{node}"]["ros__parameters"]
         assert kind(**values) == kind()
 
 
@@ -103,6 +109,7 @@ def test_the_wheel_has_the_files_of_ros_once(wheel):
         "share/ament_index/resource_index/packages/physai",
         "share/physai/config/physai.yaml",
         "share/physai/launch/arm.launch.py",
+        "share/physai/launch/fleet.launch.py",
         "share/physai/package.xml",
     ]
     assert "physai/ros/fastdds.xml" in names
@@ -185,13 +192,14 @@ class Launch(ModuleType):
     OpaqueFunction = Node = SimpleNamespace
 
 
-@pytest.fixture
-def launch_file(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+@pytest.fixture(params=["arm"])
+def launch_file(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> ModuleType:
     stub = Launch("launch")
     for name in ("launch", "launch.actions", "launch.substitutions", "launch_ros", "launch_ros.actions"):
         monkeypatch.setitem(sys.modules, name, stub)
     monkeypatch.setattr("ament_index_python.packages.get_package_share_directory", lambda _: str(PACKAGE))
-    spec = importlib.util.spec_from_file_location("arm_launch", PACKAGE / "launch" / "arm.launch.py")
+    file = PACKAGE / "launch" / f"{request.param}.launch.py"
+    spec = importlib.util.spec_from_file_location(f"{request.param}_launch", file)
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
@@ -217,6 +225,8 @@ def launched(launch_file: ModuleType, tmp_path: Path, **given: str) -> list[list
             command += ["--params-file", str(parameters)]
         for old, new in getattr(node, "remappings", []):
             command += ["-r", f"{old}:={new}"]
+        if namespace := getattr(node, "namespace", ""):
+            command += ["-r", f"__ns:=/{namespace}"]
         commands.append(command)
     return commands
 
@@ -258,6 +268,33 @@ def test_the_launch_file_drives_the_virtual_robot(launch_file, start, peer, poli
     assert publishers == {"inference_node"} | ({"command_watchdog"} if use_watchdog == "true" else set())
     assert bool(peer.node.count_publishers("/command_watchdog/commands")) == (use_watchdog == "true")
     assert not [line for process in processes for line in process.lines if "WARN" in line and "hold" not in line]
+
+
+@pytest.mark.slow
+@pytest.mark.realtime
+@pytest.mark.parametrize("launch_file", ["fleet"], indirect=True)
+def test_the_launch_file_of_a_fleet_drives_each_arm_in_its_namespace(launch_file, start, peer, policy_path, tmp_path):
+    parameters = tmp_path / "mine.yaml"
+    mine = {"autostart": True, "goal": [0.1, 0.4]}
+    parameters.write_text(yaml.safe_dump({"/**": {"inference_node": {"ros__parameters": mine}}}))
+    commands = launched(
+        launch_file,
+        tmp_path,
+        policies=f"{policy_path},{policy_path}",
+        arms="3",
+        virtual_envs="reacher,",
+        params_file=str(parameters),
+    )
+    namespaces = [command[-1] for command in commands]
+    assert namespaces == [f"__ns:=/arm{number}" for number in (1, 1, 1, 2, 2, 3, 3, 3)]
+    states: list[tuple[float, str]] = []
+    peer.listen(String, "/arm1/inference_node/state", states, qos.LATCHED, lambda message: message.data)
+    path = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
+    for command in commands[:3]:
+        start.run(command, {"PATH": path})
+    wait_for(lambda: states and states[-1][1] == "reached", 60.0, lambda: f"a goal, after {states}")
+    names = {f"{namespace}/{name}" for name, namespace in peer.node.get_node_names_and_namespaces()}
+    assert names >= {"/arm1/inference_node", "/arm1/command_watchdog", "/arm1/virtual_robot"}
 
 
 def test_package_xml_and_setup_py_agree_with_pyproject():

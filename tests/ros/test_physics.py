@@ -234,7 +234,7 @@ def test_a_rival_who_comes_later_ends_the_episode_with_zeros(start_robot, connec
     with pytest.raises(RobotError, match="another publisher"):
         move(physics, [0.5, 0.5], 200)
     wait_for(lambda: zeros_last(peer))
-    peer.node.destroy_publisher(rival)
+    peer.remove(rival)
     home(physics)
     move(physics, [0.5, 0.5], 2)
 
@@ -312,3 +312,13 @@ def test_topics_can_have_other_names(start_robot, connect):
     physics = connect(remap=["/joint_states:=/left/joint_states", f"{TOPIC}:=/left/commands"])
     q, _ = move(physics, [0.5, 0.5], 25)
     np.testing.assert_allclose(q, 0.25, atol=0.05)
+
+
+@pytest.mark.slow
+@pytest.mark.realtime
+def test_a_robot_is_found_in_its_namespace(start_robot, connect):
+    start_robot("-r", "__ns:=/arm1")
+    physics = connect(remap=["__ns:=/arm1"], reset_service="virtual_robot/reset")
+    home(physics)
+    position, _ = move(physics, [0.5, 0.0], 20)
+    assert 0.1 < position[0, 0] < 0.3

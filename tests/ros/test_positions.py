@@ -13,7 +13,7 @@ from physai.signals import Quantity
 from tests.ros.forge import forged
 from tests.ros.peer import Peer, wait_for
 
-TOPIC = controller_topic(Quantity.JOINT_POSITION)
+TOPIC = f"/{controller_topic(Quantity.JOINT_POSITION)}"
 ARM = {"overrides": "[env.robot.command=joint_position]"}
 
 

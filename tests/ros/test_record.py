@@ -222,12 +222,12 @@ def test_what_cannot_be_recorded_is_named_and_left_out(start, peer, tmp_path):
     peer.publisher(DisparityImage, "/disparity")
     peer.publisher(Goals, "/goals")
     send_numbers(peer, 10, KINDS["reliable"])
-    recorder.says("/disparity is not recorded: 'stereo_msgs/msg/DisparityImage' is not installed here")
-    recorder.says("/goals is not recorded: 'nav_msgs/msg/Goals' is no message of ROS 2 Jazzy")
+    recorder.says("/disparity is not heard: 'stereo_msgs/msg/DisparityImage' is not installed here")
+    recorder.says("/goals is not heard: 'nav_msgs/msg/Goals' is no message of ROS 2 Jazzy")
     recorder.signal(signal.SIGINT)
     assert recorder.wait() == 0
     assert numbers(tmp_path / "bag") == list(range(10))
-    assert recorder.output.count("is not recorded") == 2
+    assert recorder.output.count("is not heard") == 2
 
 
 @pytest.mark.slow

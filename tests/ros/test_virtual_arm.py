@@ -1,5 +1,6 @@
 """The virtual robot's controller and arm, without ROS."""
 
+import contextlib
 import math
 
 import numpy as np
@@ -148,3 +149,20 @@ def test_an_unknown_config_is_named(env, randomization, physics):
 def test_an_arm_is_not_simulated_by_a_robot_behind_ros():
     with pytest.raises(UserError, match="physics: 'ros' is no engine that could simulate a robot"):
         VirtualArm("reacher", "none", 0, 0.01, physics="ros")
+
+
+def test_a_velocity_gain_is_the_same_time_constant_at_any_rate():
+    """An arm that is stepped more often than its env lags as far behind."""
+    values = {"velocity_gain": 0.5, "joint_damping": 0.0, "joint_friction": 0.0}
+    draws = [
+        f"randomization.{name}={{distribution:uniform,low:{value},high:{value},operation:set}}"
+        for name, value in values.items()
+    ]
+    away = []
+    for period in (0.02, 0.005):
+        with contextlib.closing(VirtualArm("reacher", "none", 0, period, draws, "mujoco")) as arm:
+            for _ in range(round(0.4 / period)):
+                position, velocity = arm.step(np.array([0.5, 0.0]))
+            away.append(0.5 * 0.4 - (position - arm.spec.home)[0])
+            assert velocity[0] == pytest.approx(0.5, abs=5e-3)
+    np.testing.assert_allclose(away, 0.5 * 0.02, rtol=0.3)

@@ -56,5 +56,6 @@ def test_bounds_of_another_length_than_the_joints_are_refused():
 
 def test_units_follow_from_the_quantity():
     units = {quantity.value: Signal("x", quantity, (1,)).unit for quantity in Quantity}
-    of_joints = {"joint_position": "rad", "joint_velocity": "rad/s"}
-    assert units == {**of_joints, "position": "m", "pose": "", "memory": "", "view": ""}
+    of_joints = {"joint_position": "rad", "joint_velocity": "rad/s", "angular_velocity": "rad/s"}
+    none = dict.fromkeys(("pose", "direction", "twist", "action", "memory", "view"), "")
+    assert units == {**of_joints, "position": "m", "time": "s", **none}

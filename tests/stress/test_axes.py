@@ -22,6 +22,9 @@ def axis(reacher):
     return lambda name, *overrides: Axis.make(name, settings(*overrides).axes, reacher)
 
 
+OF_LEGS = ("stiffness", "servo_damping", "floor_friction", "push", "gyro_noise", "gravity_noise")
+
+
 def test_scales_are_even_in_their_logarithm_and_others_as_they_are(axis):
     np.testing.assert_allclose(axis("link_mass").values(5), [0.2, 0.2 * 5**0.5, 1.0, 5**0.5, 5.0])
     np.testing.assert_allclose(axis("payload").values(5), [0.0, 0.5, 1.0, 1.5, 2.0])
@@ -36,8 +39,10 @@ def test_delays_are_whole_control_steps_each_once(axis):
 
 def test_every_axis_of_the_config_can_be_made_and_every_parameter_that_is_drawn_is_one(env_config):
     config = env_config("reacher", "physics=mujoco", "physics.motor=servo")
+    legged = env_config("a1_walk")
     axes = settings().axes
-    assert [Axis.make(name, axes, config).name for name in axes] == list(axes)
+    made = [Axis.make(name, axes, legged if name in OF_LEGS else config).name for name in axes]
+    assert made == list(axes)
     assert set(RandomizationConfig.model_fields) - {"name"} <= set(axes)
 
 
@@ -49,6 +54,7 @@ def test_every_axis_of_the_config_can_be_made_and_every_parameter_that_is_drawn_
         ("link_mass", ["axes.link_mass.range=[0,2]"], "axes.link_mass.range: a scale must be above zero"),
         ("link_mass", ["axes.link_mass.range=[2,3]"], "axes.link_mass.range: 1, the robot as described, must be"),
         ("actuator_delay", ["axes.actuator_delay.range=[0,1.5]"], "axes.actuator_delay.range: whole control steps"),
+        ("push", [], "the axis 'push' is not one of robot 'planar_arm', which has no such parameter"),
         ("link_mass", ["axes.link_mass.range=[2,0.5]"], "axes.link_mass.range: the first of [2.0, 0.5] must be below"),
         ("payload", ["axes.payload.range=[-1,1]"], "axes.payload.range: the first of [-1.0, 1.0] must be below the"),
     ],
@@ -61,10 +67,11 @@ def test_what_makes_no_sense_is_refused_in_one_line(axis, name, overrides, said)
 
 
 @pytest.mark.parametrize("name", sorted(set(RandomizationConfig.model_fields) - {"name"}))
-def test_a_value_reaches_every_robot_and_leaves_the_other_draws_as_they_are(axis, reacher, env_config, name):
-    layout = ParameterLayout(RobotSpec.from_config(reacher.robot))
+def test_a_value_reaches_every_robot_and_leaves_the_other_draws_as_they_are(reacher, env_config, name):
+    env = env_config("a1_walk") if name in OF_LEGS else reacher
+    layout = ParameterLayout(RobotSpec.from_config(env.robot))
     config = validate(RandomizationConfig, compose("train", []).randomization)
-    drawn = axis(name)
+    drawn = Axis.make(name, settings().axes, env)
     value = drawn.values(3)[1]
     changed = config.model_copy(update={name: drawn.draw(value)})
     first, second = (one.sample(20, layout, torch.Generator().manual_seed(1)) for one in (config, changed))

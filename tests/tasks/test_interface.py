@@ -54,7 +54,7 @@ def test_errors_and_observations_are_those_of_the_module_where_a_task_does_not_w
     q, qd, goal = random.uniform(-2, 2, (3, 4, 2))
     task, state = simulation.task, RobotState(q, qd)
     np.testing.assert_allclose(task.error(state, goal), np.abs(goal - q), rtol=0, atol=1e-6)
-    observation = task.observe(state, goal)
+    observation = task.observe({"joint_position": q, "joint_velocity": qd, "goal": goal})
     assert observation.dtype == np.float32
     np.testing.assert_allclose(observation, np.hstack([q, qd, goal]), rtol=0, atol=1e-6)
 

@@ -67,7 +67,7 @@ def judged(task, distance):
     rows = len(error)
     state = RobotState(np.zeros((rows, 2)), np.zeros((rows, 2)))
     held = 0.02 * (error[:, 0] < task.tolerances[0].value)
-    step = Step(state, *np.zeros((4, rows, 2)), error, held)
+    step = Step(state, *np.zeros((4, rows, 2)), error, held, None, *np.zeros((2, rows)))
     success = task.success(step)
     return success, task.terminated(step, success), task.rewards(step, success)
 
@@ -271,7 +271,7 @@ def held_for(task, seconds, action=0.0):
     """A step of a robot that has been at its goal for so long, and changed its action by so much."""
     state = RobotState(np.zeros((1, 2)), np.zeros((1, 2)))
     still, changed = np.zeros((1, 2)), np.full((1, 2), action)
-    return Step(state, still, changed, still, still, np.zeros((1, 1)), np.array([seconds]))
+    return Step(state, still, changed, still, still, np.zeros((1, 1)), np.array([seconds]), None, *np.zeros((2, 1)))
 
 
 def test_with_settle_success_is_to_have_stayed(simulate):

@@ -187,7 +187,8 @@ def test_each_joint_near_a_limit_costs_by_how_near_it_is(simulate):
     at = np.tile((low + high) / 2, (4, 1))
     at[1, 4], at[2, 4], at[3, [0, 4]] = 0.95 * low[4], high[4] + 0.01, (low[0], high[4])
     one = np.zeros((4, 7))
-    step = Step(RobotState(at, one), one, one, one, np.zeros((4, 3)), np.zeros((4, 1)), np.zeros(4), None)
+    judged = np.zeros((4, 1)), np.zeros(4), None, *np.zeros((2, 4))
+    step = Step(RobotState(at, one), one, one, one, np.zeros((4, 3)), *judged)
     np.testing.assert_allclose(
         task.rewards(step, np.zeros(4, bool))["joint_limits"], [0.0, -0.15, -0.3, -0.6], rtol=1e-5
     )

@@ -11,12 +11,7 @@ from physai.physics import ParameterLayout, RandomizationConfig
 from physai.robots import RobotSpec
 from physai.transforms import DomainRandomization
 
-NOTHING = dict.fromkeys(
-    (
-        *("link_mass", "payload", "joint_damping", "joint_friction", "effort_limit", "velocity_gain"),
-        *("actuator_delay", "encoder_offset", "position_noise", "velocity_noise"),
-    )
-)
+NOTHING = dict.fromkeys(name for name in RandomizationConfig.model_fields if name != "name")
 
 
 def config(**draws):

@@ -61,6 +61,7 @@ class RosPhysics:
     ) -> None:
         if num_robots != 1:
             raise UserError(f"there is one robot behind ROS, not {num_robots}")
+        spec.need_fixed_base("driving")
         if homing_speed > spec.velocity_limit.min():
             raise UserError(
                 f"env.physics.homing_speed: {homing_speed} rad/s is beyond the limit of '{spec.name}', "

@@ -14,7 +14,7 @@ from std_srvs.srv import Trigger
 
 from physai.errors import UserError
 from physai.ros.node.guest import Guest
-from physai.ros.topics import qos
+from physai.ros.topics import joint_states, qos
 from physai.ros.topics.commands import JointCommands
 from physai.signals import Quantity
 
@@ -54,7 +54,7 @@ class RobotLink:
         self._commands = JointCommands(node, len(self._joints), Quantity.JOINT_VELOCITY)
         self._states = node.create_subscription(
             JointState,
-            "/joint_states",
+            joint_states.TOPIC,
             self._take,  # type: ignore[arg-type]  # rclpy also takes callbacks with two arguments
             qos.SENSOR,
             event_callbacks=qos.SILENT_SUBSCRIPTION,  # a log line on a stopped terminal would stop _watch, too

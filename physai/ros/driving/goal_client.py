@@ -13,7 +13,7 @@ from physai.deploy import Policy, State
 from physai.errors import UserError
 from physai.ros.driving.processes import NodeProcess
 from physai.ros.node.guest import Guest
-from physai.ros.topics import goals, qos
+from physai.ros.topics import goals, joint_states, qos
 from physai.ros.topics.commands import controller_topic
 from physai.signals import Tolerance
 
@@ -100,9 +100,9 @@ class GoalClient:
         self._stopped = ""
         self._guest = Guest("goal_client")
         self._node = self._guest.node
-        self._goals = self._node.create_publisher(goals.goal_type(policy.metadata.goal), "/inference_node/goal", 1)
-        self._node.create_subscription(JointState, "/joint_states", self._take_joint_state, qos.SENSOR)
-        self._node.create_subscription(String, "/inference_node/state", self._take_state, qos.LATCHED)
+        self._goals = self._node.create_publisher(goals.goal_type(policy.metadata.goal), "inference_node/goal", 1)
+        self._node.create_subscription(JointState, joint_states.TOPIC, self._take_joint_state, qos.SENSOR)
+        self._node.create_subscription(String, "inference_node/state", self._take_state, qos.LATCHED)
         self._node.create_subscription(DiagnosticArray, "/diagnostics", self._take_diagnostics, 10)
 
     def check_alone(self) -> None:
@@ -114,10 +114,11 @@ class GoalClient:
         end = time.monotonic() + _LOOK
         while time.monotonic() < end:
             self._guest.executor.spin_once(0.05)
-            commands = controller_topic(self._metadata.command.quantity)
+            topics = controller_topic(self._metadata.command.quantity), joint_states.TOPIC
+            commands, states = map(self._node.resolve_topic_name, topics)
             for name, others in (
                 (commands, self._node.count_subscribers(commands) + self._node.count_publishers(commands)),
-                ("/joint_states", self._node.count_publishers("/joint_states")),
+                (states, self._node.count_publishers(states)),
             ):
                 if others:
                     raise UserError(f"another node uses {name} here: choose another ROS_DOMAIN_ID")

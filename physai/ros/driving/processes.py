@@ -34,6 +34,7 @@ class NodeProcess:
                 stderr=subprocess.STDOUT,
                 env={**os.environ, "XDG_STATE_HOME": str(log.parent.absolute())},  # no other robot's emergency stop
                 preexec_fn=partial(die_with, os.getpid(), signal.SIGTERM),
+                start_new_session=True,  # Ctrl-C is for this program, which ends its nodes in their order
             )
         self.pid = self._process.pid
 
@@ -51,6 +52,10 @@ class NodeProcess:
         return self
 
     def __exit__(self, *_: object) -> None:
+        self.end()
+
+    def end(self) -> None:
+        """Have it end, and wait for it."""
         self._process.terminate()
         try:
             self._process.wait(_PATIENCE)

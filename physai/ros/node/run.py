@@ -21,6 +21,7 @@ from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
 from std_srvs.srv import Trigger
 
+from physai.deploy.parameters import Parameters
 from physai.errors import UserError
 from physai.ros.node import signals
 from physai.ros.node.outlet import outlets
@@ -81,7 +82,7 @@ class StoppableNode(Node, Generic[P]):
         """Leave the robot standing, or the file complete; no callback comes after it."""
 
 
-def run(make_node: Callable[[], StoppableNode[P]], module: str, about: str, kind: type[P]) -> int:
+def run(make_node: Callable[[], StoppableNode[P]], module: str, about: str, kind: type[Parameters]) -> int:
     """Run a node until a signal, its own wish or an exception ends it.
 
     ROS' own signal handlers close the context before anything can be published; ours only end the loop.

@@ -18,8 +18,8 @@ _ACKNOWLEDGED = 0.5  # s
 
 
 def controller_topic(quantity: Quantity) -> str:
-    """Where ros2_control's controller of joint velocities or positions takes commands."""
-    return f"/{quantity.value}_controller/commands"
+    """Where ros2_control's controller of joint velocities or positions takes commands, in the robot's namespace."""
+    return f"{quantity.value}_controller/commands"
 
 
 class JointCommands:

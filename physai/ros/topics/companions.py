@@ -33,8 +33,9 @@ class Companions:
             found = self._strangers(found)
         if len(found) <= 1:
             return []
-        names = [info.node_name for info in found]
-        return sorted(name for name in names if name != self._node.get_name()) or ["a node of the same name"]
+        own = self._node.get_fully_qualified_name()
+        names = [_name(info) for info in found]
+        return sorted(name.lstrip("/") for name in names if name != own) or ["a node of the same name"]
 
     def _strangers(self, found: list[TopicEndpointInfo]) -> list[TopicEndpointInfo]:
         """Leave partners out; who was one remains one until it has gone: of its two topics one goes first."""
@@ -55,4 +56,4 @@ def _process(info: TopicEndpointInfo) -> bytes:
 
 
 def _name(info: TopicEndpointInfo) -> str:
-    return f"{info.node_namespace}/{info.node_name}"
+    return f"{info.node_namespace.rstrip('/')}/{info.node_name}"

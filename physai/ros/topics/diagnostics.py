@@ -8,7 +8,7 @@ import numpy as np
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 
-from physai.deploy import Policy, State
+from physai.deploy import Driver, State
 
 _LEVELS = {
     State.WAITING.value: DiagnosticStatus.OK,
@@ -48,7 +48,7 @@ def summary(state: str, reasons: Sequence[str]) -> str:
     return f"{state}: {'; '.join(reasons)}" if reasons else state
 
 
-def diagnose(name: str, stamp: Time, policy: Policy, values: dict[str, Any]) -> DiagnosticArray:
+def diagnose(name: str, stamp: Time, policy: Driver, values: dict[str, Any]) -> DiagnosticArray:
     """Make the message from ``values``: a controller's snapshot, and whatever else is to be told."""
     flat = {**values, **{f"count: {key}": count for key, count in sorted(values["counters"].items())}}
     status = DiagnosticStatus(

@@ -1,8 +1,9 @@
-"""The topic /emergency_stop: heard from every publisher, and still pressed while a latched one says so."""
+"""Topics that stop robots: heard from every publisher, and still pressed while a latched one says so."""
 
 import time
 from collections import Counter
 from collections.abc import Callable
+from functools import partial
 
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
@@ -11,23 +12,30 @@ from std_msgs.msg import Bool
 
 from physai.ros.topics import qos
 
-TOPIC = "/emergency_stop"
+ALL = "/emergency_stop"
+"""Stops every robot, whatever its namespace."""
+
+TOPICS = (ALL, "emergency_stop")
+"""What a robot listens to: also to one of its own, in its namespace; outside of one, both are the same."""
+
 _AGAIN = 0.5  # s until all latched publishers have surely told again what they said last
 
 
 class EmergencyStopTopic:
-    """Listens to /emergency_stop.
+    """Listens to one of them.
 
     Args:
         node: Whose subscriptions they are.
         stop: Called at each true.
+        topic: Which one.
     """
 
-    def __init__(self, node: Node, stop: Callable[[], None]) -> None:
+    def __init__(self, node: Node, stop: Callable[[], None], topic: str = ALL) -> None:
         self._node = node
+        self._topic = topic
         self._stop = stop
         for profile in qos.EMERGENCY:
-            node.create_subscription(Bool, TOPIC, self._take, profile, event_callbacks=qos.SILENT_SUBSCRIPTION)
+            node.create_subscription(Bool, topic, self._take, profile, event_callbacks=qos.SILENT_SUBSCRIPTION)
         # What latched publishers said last. A message does not tell whose it is, but has a number: it follows the one
         # with the number before, a false if there are several. A false takes the place of a true only where each
         # publisher has had its say: else the true may be another's. Too many are forgotten when all are asked again.
@@ -38,7 +46,7 @@ class EmergencyStopTopic:
     def _subscribe(self) -> Subscription:
         return self._node.create_subscription(
             Bool,
-            TOPIC,
+            self._topic,
             self._take_latched,  # type: ignore[arg-type]  # rclpy also takes callbacks with two arguments
             qos.EMERGENCY_LATCHED,
             event_callbacks=qos.SILENT_SUBSCRIPTION,
@@ -61,7 +69,7 @@ class EmergencyStopTopic:
     def _latching(self) -> list[str]:
         return [
             info.node_name
-            for info in self._node.get_publishers_info_by_topic(TOPIC)
+            for info in self._node.get_publishers_info_by_topic(self._topic)
             if info.qos_profile.durability is DurabilityPolicy.TRANSIENT_LOCAL
             and info.qos_profile.reliability is ReliabilityPolicy.RELIABLE
         ]
@@ -69,7 +77,7 @@ class EmergencyStopTopic:
     def held(self) -> str | None:
         """Why a reset would be wrong now, or None: who latches a true still does."""
         if time.monotonic() - self._asked < _AGAIN:
-            return f"looking whether {TOPIC} is still true: call again"
+            return f"looking whether {self._latched.topic_name} is still true: call again"
         latching = self._latching()
         if not latching or not any(pressed for _, pressed in self._last):
             return None
@@ -78,4 +86,21 @@ class EmergencyStopTopic:
         self._last.clear()
         self._latched = self._subscribe()
         self._asked = time.monotonic()
-        return f"{TOPIC} is still true, latched: {', '.join(sorted(latching))}"
+        return f"{self._latched.topic_name} is still true, latched: {', '.join(sorted(latching))}"
+
+
+class EmergencyStopTopics:
+    """Listens to all that stop a robot.
+
+    Args:
+        node: The robot's; its namespace counts.
+        stop: Called at each true, with the name of the topic.
+    """
+
+    def __init__(self, node: Node, stop: Callable[[str], None]) -> None:
+        names = dict.fromkeys(map(node.resolve_topic_name, TOPICS))
+        self._topics = [EmergencyStopTopic(node, partial(stop, name), name) for name in names]
+
+    def held(self) -> str | None:
+        """Why a reset would be wrong now, or None; each is asked, so that none has to wait for the others."""
+        return "; ".join(filter(None, [topic.held() for topic in self._topics])) or None

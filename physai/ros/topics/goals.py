@@ -12,6 +12,9 @@ from physai.deploy import Goal
 from physai.errors import UserError
 from physai.signals import Quantity, Signal
 
+DESCRIPTION = "~/goal_description"
+"""What goals are, and where they lie: the JSON of :func:`physai.deploy.metadata.describe_goal`, latched."""
+
 _TYPES = {Quantity.POSITION: PointStamped, Quantity.POSE: PoseStamped, Quantity.JOINT_POSITION: JointState}
 _POSITION, _ORIENTATION = ("x", "y", "z"), ("x", "y", "z", "w")
 

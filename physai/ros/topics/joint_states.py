@@ -10,7 +10,7 @@ from sensor_msgs.msg import JointState as JointStateMessage
 from physai.deploy import JointState
 from physai.ros.topics import qos
 
-TOPIC = "/joint_states"
+TOPIC = "joint_states"  # in the robot's namespace
 # Numbers of lost messages are skipped, at most so many and so many a second; farther on counts somebody else.
 _LOST, _FASTEST = 64, 2000.0
 _RIVALRY = 3.0  # s; two publishers are rivals for so long after they have taken turns

@@ -19,7 +19,7 @@ class WatchedCommands(JointCommands):
         node: Whose remaps hold.
         joints: How many numbers a command has.
         quantity: What they are, joint velocities or joint positions.
-        watchdog: Name of its node, such as ``/command_watchdog``.
+        watchdog: Name of its node, such as ``command_watchdog``.
         timeout: A watchdog that was silent for longer does not answer, s.
 
     Attributes:

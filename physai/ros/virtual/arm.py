@@ -59,12 +59,15 @@ class VirtualArm:
     """One simulated arm as its sensors show it, with the dynamics, delay and sensor errors of a randomization config.
 
     Args:
-        env: A file of ``conf/env``.
-        randomization: A file of ``conf/randomization``.
+        env: A file of ``conf/env``, or the path of another.
+        randomization: A file of ``conf/randomization``, or the path of another.
         seed: Draws one robot from it.
         period: Time from step to step, s.
         overrides: Hydra overrides such as ``env.robot.command=joint_position``.
         physics: A file of ``conf/physics``: its engine, also where the env brings one along.
+
+    Attributes:
+        effort: What its motors gave in the last step, N·m, [n].
 
     Raises:
         UserError: If there is no such config.
@@ -82,7 +85,7 @@ class VirtualArm:
         groups = {"env": env, "randomization": randomization, "physics": physics}
         for group, name in groups.items():
             files = [path.stem for path in (conf_dir() / group).glob("*.yaml")]
-            if name not in files:
+            if name not in files and not name.endswith(".yaml"):
                 raise UserError(f"{group}: no file '{name}' in conf/{group}{nearest(name, files)}")
         node = compose("train", [*(f"{group}={name}" for group, name in groups.items()), *overrides])
         node.env.physics = node.physics
@@ -91,10 +94,12 @@ class VirtualArm:
             raise UserError(f"physics: '{physics}' is no engine that could simulate a robot")
         draws = validate(RandomizationConfig, node.randomization)
         self.spec = RobotSpec.from_config(config.robot)
+        self.spec.need_fixed_base("a virtual")
         self._physics: Physics = make("physics", config.physics, self.spec, 1, period, needs=("reset", "step", "close"))
         layout = ParameterLayout(self.spec)
+        draws.check(layout)
         self._parameters = draws.sample(1, layout, torch.Generator().manual_seed(derive(seed, "virtual robot")))
-        self._dynamics = layout.dynamics(self._parameters.numpy())
+        self._dynamics = layout.dynamics(self._parameters.numpy(), config.control_dt / period)
         delay = float(self._parameters[0, layout.columns["actuator_delay"]])
         self._steps = np.array([round(delay * config.control_dt / period)])
         self._delay = ActuatorDelay(1, len(self.spec.joints))
@@ -109,12 +114,15 @@ class VirtualArm:
         home, row = self.spec.home[None], np.zeros(1, dtype=int)
         self._physics.reset(row, RobotState(home, np.zeros_like(home)), self._dynamics)
         self._delay.reset(row, self.rest[None], self._steps)
+        self.effort = np.zeros_like(home[0])
 
     def step(self, command: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Hold a command [n], rad/s or rad, for a period; return what the sensors say, rad [n] and rad/s [n]."""
         state = self._physics.step(self._delay(command[None]))
         true = torch.from_numpy(state.joint_position), torch.from_numpy(state.joint_velocity)
         position, velocity = self._errors(*true, self._parameters.double(), self._random)
+        assert state.joint_effort is not None
+        self.effort = state.joint_effort[0]
         return position[0].numpy(), velocity[0].numpy()
 
     def close(self) -> None:

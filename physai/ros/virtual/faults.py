@@ -48,12 +48,16 @@ class Faults:
     def _spoil(self, state: JointState) -> JointState:
         config, draw = self.config, self._random
         names, position, velocity = np.array(state.names), np.array(state.position), np.array(state.velocity)
+        effort = state.effort
         position = position + config.fault_noise * draw.standard_normal(len(position))
         if draw.random() < config.fault_nan:
             position[draw.integers(len(position))] = np.nan
         if config.fault_reorder:
             order = draw.permutation(len(names))
             names, position, velocity = names[order], position[order], velocity[order]
+            effort = [effort[joint] for joint in order] if effort else effort  # of a robot that tells it
         if config.fault_empty_velocity:
             velocity = velocity[:0]
-        return replace(state, names=names.tolist(), position=position.tolist(), velocity=velocity.tolist())
+        return replace(
+            state, names=names.tolist(), position=position.tolist(), velocity=velocity.tolist(), effort=effort
+        )

@@ -16,17 +16,53 @@ NOISE = 1e-3, 2e-2  # rad, rad/s
 
 @dataclass(frozen=True)
 class Hidden:
-    """A robot that was drawn, and a recording of it."""
+    """A robot that was drawn, and a recording of it.
+
+    Attributes:
+        spec: What its makers say of it.
+        layout: Of its parameters.
+        parameters: What it is like, [P].
+        delay: Of its actuators, control steps.
+        recording: What was seen of it.
+    """
 
     spec: RobotSpec
     layout: ParameterLayout
-    parameters: np.ndarray  # [P]
+    parameters: np.ndarray
     delay: int
     recording: Recording
 
+    def itself(self) -> RandomizationConfig:
+        """Return a randomization that draws nothing but this robot, with the noise of its sensors."""
+        noise = dict(zip(("position_noise", "velocity_noise"), NOISE, strict=True))
+        draws = {
+            name: {"distribution": "uniform", "low": value, "high": value, "operation": "set"}
+            for name, columns in self.layout.columns.items()
+            for value in [
+                [noise[name]]
+                if name in noise
+                else [float(self.delay)]
+                if name == "actuator_delay"
+                else self.parameters[columns].tolist()
+            ]
+        }
+        others = dict.fromkeys(RandomizationConfig.model_fields)  # what this robot has not
+        return RandomizationConfig.model_validate({**others, **draws, "name": "hidden"})
 
-def record(config: EnvConfig, draws: RandomizationConfig, kept: list[str], seconds: float, seed: int) -> Hidden:
-    """Draw a robot, all as described but for the parameters ``kept`` and its delay; let it jerk and rest in turns."""
+
+def record(
+    config: EnvConfig, draws: RandomizationConfig, kept: list[str], seconds: float, seed: int, feels: bool = False
+) -> Hidden:
+    """Draw a robot, all as described but for the parameters ``kept`` and its delay; let it jerk and rest in turns.
+
+    Args:
+        config: Its env, and the engine that it lives in.
+        draws: What its parameters are drawn from.
+        kept: Names of those that are.
+        seconds: How long it moves.
+        seed: Draws all of it.
+        feels: Whether it tells efforts.
+    """
     spec = RobotSpec.from_config(config.robot)
     layout = ParameterLayout(spec)
     random = np.random.default_rng(seed)
@@ -39,15 +75,18 @@ def record(config: EnvConfig, draws: RandomizationConfig, kept: list[str], secon
     command = jerks(steps, spec.velocity_limit, random)
     physics: Physics = make("physics", config.physics, spec, 1, config.control_dt, needs=("reset", "step", "close"))
     physics.reset(np.arange(1), RobotState(spec.home[None], np.zeros((1, len(spec.home)))), layout.dynamics(drawn))
-    measured = np.empty((2, steps, len(spec.home)))
+    measured, effort = np.empty((2, steps, len(spec.home))), np.full((steps, len(spec.home)), np.nan)
     for step in range(steps):
         state = physics.robot_state()
         measured[:, step] = state.joint_position[0], state.joint_velocity[0]
+        if feels and state.joint_effort is not None:
+            effort[step] = state.joint_effort[0]
         physics.step(command[max(step - delay, 0)][None])
     physics.close()
     measured[0] += drawn[0, layout.columns["encoder_offset"]]
     measured += np.array(NOISE)[:, None, None] * random.standard_normal(measured.shape)
-    return Hidden(spec, layout, drawn[0], delay, Recording(config.control_dt, *measured, command))
+    recording = Recording(config.control_dt, measured[0], measured[1], command, effort)
+    return Hidden(spec, layout, drawn[0], delay, recording)
 
 
 def jerks(steps: int, fastest: np.ndarray, random: np.random.Generator) -> np.ndarray:
@@ -67,7 +106,7 @@ def jerks(steps: int, fastest: np.ndarray, random: np.random.Generator) -> np.nd
 
 def write_table(recording: Recording, joints: tuple[str, ...], path: str) -> None:
     """Write a recording as a CSV."""
-    names = [f"{what}[{joint}]" for what in ("position", "velocity", "command") for joint in joints]
-    time = recording.control_dt * np.arange(len(recording))[:, None]
-    rows = np.hstack([time, recording.position, recording.velocity, recording.command])
+    names = [f"{what}[{joint}]" for what in ("position", "velocity", "command", "effort") for joint in joints]
+    time = recording.period * np.arange(len(recording))[:, None]
+    rows = np.hstack([time, recording.position, recording.velocity, recording.command, recording.effort])
     np.savetxt(path, rows, delimiter=",", header=",".join(["time", *names]), comments="", fmt="%.9g")

@@ -1,0 +1,38 @@
+"""Which policies a demo takes, and the virtual robot that each was trained for."""
+
+import json
+from pathlib import Path
+
+from physai.compose import conf_dir
+from physai.deploy import Metadata
+from physai.errors import UserError
+
+
+def newest_policies() -> list[Path]:
+    """Return the policy files of ``outputs/``, the newest one first.
+
+    Raises:
+        UserError: If there is none.
+    """
+    found = sorted(Path("outputs").glob("**/policy.pt"), key=lambda path: path.stat().st_mtime, reverse=True)
+    if not found:
+        raise UserError("no policy.pt in outputs/: train one (python -m physai.train), or name one")
+    return found
+
+
+def robot_overrides(metadata: Metadata) -> list[str]:
+    """What makes the virtual robot the one that the policy was trained on: Hydra overrides of its env.
+
+    Raises:
+        UserError: If ``conf/robot`` has no such robot: a URDF that a policy file names is not read.
+    """
+    robot = metadata.raw["config"]["env"]["robot"]
+    files = [path.stem for path in (conf_dir() / "robot").glob("*.yaml")]
+    if metadata.robot not in files:
+        raise UserError(f"the policy is for '{metadata.robot}', and conf/robot has only {', '.join(sorted(files))}")
+    changed = ("joints", "end_effector", "home", "command", "command_limit", "position_gain", "gravity")
+    return [
+        f"robot@env.robot={metadata.robot}",
+        *(f"env.robot.{key}={json.dumps(robot[key])}" for key in changed),
+        f"env.start.spread={json.dumps([0.0] * len(robot['joints']))}",
+    ]

@@ -1,0 +1,110 @@
+"""``python -m physai.ros.fleet``: many virtual robots, each with its policy and its watchdog (see ``--help``)."""
+
+import os
+import signal
+import tempfile
+from contextlib import ExitStack, closing
+from itertools import cycle, islice
+from pathlib import Path
+from typing import Any
+
+from omegaconf import DictConfig
+from rich.console import Console
+
+from physai import cli
+from physai.compose import compose
+from physai.config import Config, Count, PositiveFloat, Seed, validate
+from physai.deploy import Metadata, State, read_metadata
+from physai.errors import UserError
+from physai.ros.driving.policies import newest_policies, robot_overrides
+
+_FOREVER = 1e9  # s
+_PER_CORE = 1.5  # arms, with their nodes
+_MOST = 9  # arms: more processes than that do not find each other on one computer's loopback
+
+
+class FleetConfig(Config):
+    """``conf/fleet.yaml``."""
+
+    policies: list[str]
+    arms: Count
+    max_velocity: PositiveFloat
+    hold: PositiveFloat
+    seconds: PositiveFloat | None
+    randomization: dict[str, Any]
+    seed: Seed
+
+    @property
+    def robot(self) -> str:
+        """File of ``conf/randomization`` that the robots are drawn from."""
+        return str(self.randomization["name"])
+
+    def fleet(self) -> dict[str, tuple[Path, Metadata]]:
+        """The policy in each namespace, in turns.
+
+        Raises:
+            UserError: If there is none, or a file is none.
+        """
+        if self.policies:
+            found = [(Path(path), read_metadata(path)) for path in self.policies]
+        else:
+            newest: dict[str, tuple[Path, Metadata]] = {}
+            for path in newest_policies():
+                metadata = read_metadata(path)
+                newest.setdefault(metadata.robot, (path, metadata))
+            found = list(newest.values())
+        return {f"/arm{number}": each for number, each in enumerate(islice(cycle(found), self.arms), 1)}
+
+
+def _check(node: DictConfig) -> None:
+    config = validate(FleetConfig, node)
+    if config.arms > _MOST:
+        raise UserError(f"arms: {_MOST} at most, got {config.arms}")
+    if node.randomization != compose("train", [f"randomization={config.robot}"]).randomization:
+        raise UserError("randomization: the virtual robots take a file of conf/randomization as it is")
+    for path, metadata in config.fleet().values():
+        robot_overrides(metadata)
+        if config.max_velocity > metadata.velocity_limit.min():
+            raise UserError(f"max_velocity: the limit of {path} is {metadata.velocity_limit.min():g} rad/s")
+
+
+def _fleet(node: DictConfig, _: Path) -> None:
+    os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"  # no robot but ours shall hear of this
+    from physai.ros.driving.fleet_client import Arm, FleetClient
+    from physai.ros.driving.fleet_nodes import fleet_nodes
+
+    config = validate(FleetConfig, node)
+    fleet = config.fleet()
+    console = Console(highlight=False, soft_wrap=True)
+
+    def tell(namespace: str, arm: Arm) -> None:
+        if arm.state in (State.HOLD.value, State.FAULT.value, State.ESTOP.value):
+            console.print(f"{namespace}: {arm.why}")
+
+    with ExitStack() as stack:
+        logs = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="physai-fleet-")))
+        for namespace, (path, metadata) in fleet.items():
+            console.print(f"{namespace}: {path} drives a virtual {metadata.robot}")
+        cores = os.cpu_count() or 1
+        if config.arms > (enough := max(1, int(_PER_CORE * cores))):
+            console.print(
+                f"{config.arms} arms are many for {cores} cores, and one that is late stops: try arms={enough}"
+            )
+        nodes = stack.enter_context(fleet_nodes(fleet, config.robot, config.max_velocity, config.seed, logs))
+        client = FleetClient({name: metadata for name, (_, metadata) in fleet.items()}, config.seed, tell)
+        stack.enter_context(closing(client))
+        client.wait_until_ready(nodes)
+        console.print("all of them work; sending goals (Ctrl-C ends it)")
+        try:
+            client.drive(nodes, config.hold, config.seconds or _FOREVER)
+        except KeyboardInterrupt:
+            if config.seconds is not None:
+                raise
+        for namespace, arm in client.arms.items():
+            console.print(f"{namespace}: {arm.reached} of {arm.sent} goals reached; {arm.state}")
+
+
+if __name__ == "__main__":
+    if signal.getsignal(signal.SIGINT) is signal.SIG_DFL:  # as physai.ros wants it while a node is importing
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+    cli.main("fleet", _fleet, _check)

@@ -1,0 +1,23 @@
+"""The measurement of identifications runs, and shows every figure."""
+
+import pytest
+from rich.console import Console
+
+from physai.bench import identify
+
+
+@pytest.mark.slow
+def test_hidden_robots_are_found_in_both_engines_and_shown():
+    found = identify.measure_identify(seed=0, robots=1, seconds=8.0)
+    assert [len(each) for each in found.values()] == [1, 1, 1, 1]
+    same, other = found["same engine"][0], found["other engine"][0]
+    assert same.fit.explained
+    assert not other.fit.explained
+    assert same.noise < 1.5 < other.noise
+    assert other.better > 1.0
+    assert same.held.size > 0
+    console = Console(width=200, record=True)
+    console.print(identify.identify_table(found))
+    shown = console.export_text()
+    for part in (*found, "link mass", "held out"):
+        assert part in shown

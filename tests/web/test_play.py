@@ -1,0 +1,138 @@
+"""The page of play as a person uses it: a real browser, a real mouse, a trained policy."""
+
+import io
+import re
+import shutil
+import time
+
+import imageio.v3 as imageio
+import numpy as np
+import pytest
+
+from physai.web.server import camera
+
+REACH = 0.55  # m, of the arm
+SIZE = {"width": 800, "height": 520}
+GREEN, ORANGE = (30, 180, 80), (242, 115, 31)  # the goal, the upper arm
+
+
+def picture(page):
+    return imageio.imread(io.BytesIO(page.locator("canvas").first.screenshot()))[..., :3].astype(float)
+
+
+def colored(image, red, green, blue):
+    """Pixels of about that hue, whatever the light is, [N, 2] as x and y; not those of what viser says in a corner."""
+    wanted = np.array([red, green, blue], dtype=float)
+    flat = image - image.min(axis=2, keepdims=True)
+    near = (flat @ (wanted - wanted.min())) / (
+        np.linalg.norm(flat, axis=2) * np.linalg.norm(wanted - wanted.min()) + 1e-9
+    )
+    mask = (near > 0.975) & (flat.max(axis=2) > 40)
+    mask[:200, :330] = False
+    return np.argwhere(mask)[:, ::-1]
+
+
+class Camera:
+    """Where points of the plane z = 0 are in a picture, and back."""
+
+    def __init__(self, image):
+        self.height, self.width = image.shape[:2]
+        self.position, target = map(np.array, camera(REACH))
+        ahead = (target - self.position) / np.linalg.norm(target - self.position)
+        right = np.cross(ahead, [0, 0, 1])
+        right /= np.linalg.norm(right)
+        self.axes = np.stack([right, np.cross(ahead, right), ahead])  # x to the right, y down
+        self.focal = self.height / 2 / np.tan(np.radians(75) / 2)
+
+    def pixel(self, x, y):
+        across, down, away = self.axes @ (np.array([x, y, 0.0]) - self.position)
+        return self.width / 2 + self.focal * across / away, self.height / 2 + self.focal * down / away
+
+    def point(self, x, y):
+        ray = np.array([x - self.width / 2, y - self.height / 2, self.focal]) @ self.axes
+        return (self.position - ray * self.position[2] / ray[2])[:2]
+
+
+def distance(page):
+    return float(re.search(r"goal: ([\d.]+) m", page.get_by_text("to the goal").inner_text())[1])
+
+
+def upper_arm(image, seen):
+    """Its pixels: those of the orange colour that are no farther from the base than it is long."""
+    pixels = colored(image, *ORANGE)
+    return pixels[[np.hypot(*seen.point(*pixel)) < 0.32 for pixel in pixels]]
+
+
+def goal_of(page, seen):
+    return seen.point(*np.median(colored(picture(page), *GREEN), axis=0))
+
+
+def drawn(page):
+    """Wait for two pictures: with one of them, the page finds out what is under the mouse."""
+    page.evaluate("() => new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))")
+    page.wait_for_timeout(50)
+
+
+def wait_until(condition, seconds=20.0):
+    end = time.monotonic() + seconds
+    while not (found := condition()):
+        assert time.monotonic() < end, "it has not happened"
+        time.sleep(0.1)
+    return found
+
+
+@pytest.fixture
+def page(browser, serving, exported_run, tmp_path):
+    shutil.copy(exported_run / "policy.pt", tmp_path)
+    with serving("play", "run=policy.pt", "randomization=none", "seed=8") as address:
+        page = browser.new_page(viewport=SIZE)
+        page.goto(address)
+        page.get_by_text("Goals by themselves").wait_for()
+        yield page
+        page.close()
+
+
+@pytest.mark.slow
+def test_an_arm_follows_the_goal_that_the_mouse_drags_and_stands_still_when_paused(page):
+    """Of a policy file alone, in another folder; the half minute goes into pictures, which no other test looks at."""
+    wait_until(lambda: len(colored(picture(page), *GREEN)) > 50)
+    wait_until(lambda: distance(page) < 0.05)
+    time.sleep(1.0)
+    before = picture(page)
+    seen = Camera(before)
+    x, y = 0.269, 0.350  # of this seed
+    assert goal_of(page, seen) == pytest.approx([x, y], abs=0.05)  # the arrow is green, too
+
+    # Along the arrow that shows the axis y, to another place.
+    there = -0.2
+    box = page.locator("canvas").first.bounding_box()
+    for share in np.linspace(0.0, 1.0, 8):
+        across, down = seen.pixel(x, y + 0.08 + share * (there - y))
+        page.mouse.move(box["x"] + across, box["y"] + down)
+        drawn(page)
+        if share == 0.0:
+            page.mouse.down()
+            drawn(page)
+    page.mouse.up()
+    wait_until(lambda: np.abs(goal_of(page, seen) - [x, there]).max() < 0.1, 30.0)
+    wait_until(lambda: distance(page) < 0.05)
+    time.sleep(1.0)
+    after = picture(page)
+
+    # The upper arm is orange, with its middle where middles are; the forearm is between its end and the goal.
+    base = np.array(seen.pixel(0.0, 0.0))
+    for image, other in ((before, after), (after, before)):
+        arm = upper_arm(image, seen)
+        assert np.linalg.norm(seen.point(*np.median(arm, axis=0))) == pytest.approx(0.15, abs=0.06)
+        elbow = arm[np.linalg.norm(arm - base, axis=1).argmax()]
+        column, row = ((elbow + np.median(colored(image, *GREEN), axis=0)) / 2).astype(int)
+        around = slice(row - 6, row + 7), slice(column - 6, column + 7)
+        assert np.abs(image[around] - other[around]).max() > 40
+
+    page.get_by_role("button", name="Pause").click()
+    time.sleep(0.5)
+    paused = picture(page)
+    page.get_by_role("button", name="Another goal").click()
+    wait_until(lambda: np.abs(goal_of(page, seen) - [x, there]).max() > 0.1)
+    still = np.median(upper_arm(picture(page), seen), axis=0)
+    assert still == pytest.approx(np.median(upper_arm(paused, seen), axis=0), abs=3.0)

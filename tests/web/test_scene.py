@@ -1,0 +1,90 @@
+"""What a robot looks like, and a goal that is dragged: without a browser."""
+
+import asyncio
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+from physai.deploy import read_metadata
+from physai.envs.simulation import Simulation
+from physai.errors import UserError
+from physai.robots import ForwardKinematics, RobotSpec
+from physai.web import Appearance, GoalMarker, RobotScene, serve
+from physai.web.appearance import robot_of
+
+
+def test_any_arm_has_something_to_show_of_each_body_that_moves_and_its_tip_is_where_kinematics_say(any_arm):
+    spec = RobotSpec.from_config(any_arm.robot)
+    look = Appearance.of_robot(spec)
+    assert look.joints == len(spec.joints)
+    assert all(body is not None and body[:4] == b"glTF" for body in look.bodies)
+    position = spec.sample(1, np.random.default_rng(0))
+    expected = ForwardKinematics(spec)(torch.from_numpy(position).float())[0].numpy()
+    assert look.tip_position(position[0]) == pytest.approx(expected, abs=1e-5)
+
+
+def test_a_policy_file_is_drawn_by_its_urdf_or_says_why_it_cannot_be(exported_run, monkeypatch):
+    metadata = read_metadata(exported_run / "policy.pt")
+    assert Appearance.of_policy(metadata).bodies == Appearance.of_robot(robot_of(metadata)).bodies
+    monkeypatch.setitem(metadata.raw["robot"], "urdf_sha256", "of another one")
+    with pytest.raises(UserError, match=r"the policy has no capsules; .*not the URDF that the policy was trained with"):
+        Appearance.of_policy(metadata)
+
+
+def test_a_policy_file_whose_urdf_is_elsewhere_is_drawn_by_its_capsules(env_config):
+    spec = RobotSpec.from_config(env_config("kuka7_reach").robot)
+    metadata = SimpleNamespace(raw={"config": {}}, robot="kuka", collision=spec.collision)
+    look = Appearance.of_policy(metadata)
+    whole = Appearance.of_robot(spec)
+    assert [body is not None for body in look.bodies].count(True) >= len(spec.joints)
+    assert look.frames(spec.home) == pytest.approx(whole.frames(spec.home))
+
+
+@pytest.mark.parametrize("env", ["reacher", "xarm_reach", "panda_pose"])
+def test_a_goal_that_is_dragged_is_told_as_the_task_has_it(env_config, env):
+    simulation = Simulation(env_config(env, "physics=mujoco"), 1, 0)
+    simulation.close()
+    spec, task = simulation.spec, simulation.task
+    goal = simulation.task.sample_goal(1, simulation.generator)[0]
+    look, told = Appearance.of_robot(spec), []
+    with serve("127.0.0.1", 0, env, look.reach) as server:
+        robot = RobotScene(server, "robot", look)
+        marker = GoalMarker(
+            robot, server, task.goal, task.tolerances, task.region, spec.home, lambda *event: told.append(event)
+        )
+        marker.show(goal)
+        handle = marker._handle
+        event = SimpleNamespace(target=handle, phase="update")
+        asyncio.run(marker._dragged(event))
+        asyncio.run(marker._dragged(SimpleNamespace(target=handle, phase="end")))
+    assert [released for _, released in told] == [False, True]
+    assert told[0][0] == pytest.approx(goal, abs=1e-6)
+
+
+def test_numbers_that_are_none_leave_a_robot_as_it_is_and_too_few_are_refused(env_config):
+    spec = RobotSpec.from_config(env_config("reacher").robot)
+    with serve("127.0.0.1", 0, "reacher", 0.55) as server:
+        robot = RobotScene(server, "robot", Appearance.of_robot(spec))
+        robot.show(np.array([0.3, 0.4]))
+        before = robot._bodies[2].position.copy()
+        robot.show(np.array([np.nan, 0.4]))
+        assert (robot._bodies[2].position == before).all()
+        with pytest.raises(ValueError, match="2 joint positions are needed"):
+            robot.show(np.zeros(3))
+
+
+def test_a_port_that_is_taken_is_refused_in_one_line():
+    with (
+        serve("127.0.0.1", 0, "first", 1.0) as server,
+        pytest.raises(UserError, match=r"cannot listen on 127\.0\.0\.1, port \d+: Address already in use"),
+        serve("127.0.0.1", server.get_port(), "second", 1.0),
+    ):
+        pass
+
+
+def test_no_client_can_have_the_page_shown_to_the_internet():
+    with serve("127.0.0.1", 0, "page", 1.0) as server:
+        assert server.request_share_url() is None
+        assert server._share_tunnel is None

@@ -1,0 +1,53 @@
+"""A client of viser's pages that says whatever it likes, as no browser would."""
+
+from typing import Any
+
+import msgspec
+import viser
+from viser import _messages
+from websockets.sync.client import ClientConnection, connect
+
+CAMERA = _messages.ViewerCameraMessage(
+    (1.0, 0.0, 0.0, 0.0), (1.0, 1.0, 1.0), 1.0, 0.1, 10.0, 100, 100, (0.0, 0.0, 0.0), (0.0, 0.0, 1.0)
+)
+
+
+class Visitor:
+    """Connected to a page, and looking at it.
+
+    Args:
+        host: Of the page.
+        port: Of the page.
+        origin: The page that it claims to be.
+        cookie: What it shows.
+        **options: Of the connection.
+    """
+
+    def __init__(self, host: str, port: int, origin: str | None = None, cookie: str = "", **options: Any) -> None:
+        self.socket: ClientConnection = connect(
+            f"ws://{host}:{port}",
+            origin=origin or f"http://{host}:{port}",  # type: ignore[arg-type]
+            additional_headers={"Cookie": cookie} if cookie else {},
+            subprotocols=[f"viser-v{viser.__version__}"],  # type: ignore[list-item]
+            max_size=None,
+            **options,
+        )
+        self.say(CAMERA)
+
+    def say(self, message: Any) -> None:
+        self.socket.send(msgspec.msgpack.encode(message.as_serializable_dict()))
+
+    def press(self, button: str) -> None:
+        """Press the button with this id."""
+        self.say(_messages.GuiUpdateMessage(button, {"value": True}))
+
+    def drag(self, name: str, *positions: tuple[float, float, float], release: bool = True) -> None:
+        """Drag what has this name in the scene along positions."""
+        self.say(_messages.TransformControlsDragStartMessage(name))
+        for position in positions:
+            self.say(_messages.TransformControlsUpdateMessage(name, (1.0, 0.0, 0.0, 0.0), position))
+        if release:
+            self.say(_messages.TransformControlsDragEndMessage(name))
+
+    def close(self) -> None:
+        self.socket.close()
