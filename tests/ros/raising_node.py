@@ -1,17 +1,17 @@
-"""The inference node, with a controller that raises when the arm has moved for 20 ticks."""
+"""The inference node, with a controller that raises at a goal that comes while the arm moves."""
 
 from physai.deploy import Controller
 from physai.ros import inference_node
 
 
 class RaisingController(Controller):
-    moved = 0
+    moving = False
 
-    def update(self, *args, **kwargs):
-        command = super().update(*args, **kwargs)
-        self.moved += command.value is not None and command.value.any()
-        if self.moved > 20:
+    def update(self, now, joint_state=None, goal=None, interlocks=()):
+        if goal is not None and self.moving:
             raise RuntimeError("the controller broke")
+        command = super().update(now, joint_state, goal, interlocks)
+        self.moving = command.value is not None and command.value.any()
         return command
 
 

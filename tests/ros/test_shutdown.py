@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.ros.loop import closed_loop
+from tests.ros.loop import FAR, closed_loop
 from tests.ros.peer import TOPIC, Peer, node_command, wait_for
 
 GOAL = "[-0.3, -0.2]"
@@ -41,7 +41,9 @@ def test_the_last_command_is_zero_five_times_of_five(policy_path, end, code):
         loops = [stack.enter_context(closed_loop(policy_path, rate=50.0, module=module, goal=GOAL)) for _ in range(5)]
         for loop in loops:
             loop.peer.moved()
-            if not raising:  # the controller does it by itself
+            if raising:
+                loop.peer.send_goal(*FAR)
+            else:
                 loop.node.signal(end)
         for loop in loops:
             assert loop.node.wait() == code, loop.node.output
