@@ -27,7 +27,8 @@ def describe_robot(simulation: Simulation, policy: DeployablePolicy) -> dict[str
         "robot": {
             "name": spec.name,
             "joints": list(spec.joints),
-            "end_effector": spec.end_effector,
+            "base": "fixed" if spec.floating is None else "floating",
+            "end_effector": spec.end_effector or "",
             "urdf_sha256": hashlib.sha256(spec.urdf.read_bytes()).hexdigest(),
             "home": spec.home.tolist(),
         },
@@ -44,7 +45,7 @@ def describe_robot(simulation: Simulation, policy: DeployablePolicy) -> dict[str
             "region": describe_region(task.region),
             "tolerances": [vars(tolerance) for tolerance in task.tolerances],
         },
-        "kinematics": _kinematics(spec),
+        **({"kinematics": _kinematics(spec)} if spec.end_effector else {}),
         "collision": None if (model := capsules(simulation)) is None else model.describe(),
     }
 

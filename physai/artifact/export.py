@@ -25,11 +25,12 @@ from physai.errors import UserError
 from physai.files import write_atomically
 from physai.seeding import derive
 from physai.training.config import TrainConfig
+from physai.training.evaluation import Evaluation
 from physai.training.run import TrainedPolicy, git_commit
 
 FILES = {"torchscript": "policy.pt", "onnx": "policy.onnx"}
 EPISODES = 200  # that the artifact drives before it is written
-TRANSFER_EPISODES = 1000  # in the other engine
+TRANSFER_EPISODES, TRANSFER_STEPS = 1000, 200_000  # at most, in the other engine
 GOLDEN_PAIRS = 32
 SEED = derive(0, "export")
 _ROBOTS = 200
@@ -71,8 +72,9 @@ def export_policy(
     with closing(env):
         forms = agreeing_forms(actor, env, formats, report)
         driven = gate.check_drive(forms.content, forms.policy, actor, env, episodes, SEED)
-        report(f"drives {episodes:,} episodes", f"reaches {driven.success_rate:.1%} of the goals, as the policy does")
-        opinion = _second_opinion(forms.content, forms.policy, trained, report)
+        report(f"drives {episodes:,} episodes", f"{_how_well(driven)}, as the policy does")
+        short = min(TRANSFER_EPISODES, max(1, TRANSFER_STEPS // env.simulation.task.max_steps))
+        opinion = _second_opinion(forms.content, forms.policy, trained, short, report)
         if opinion is not None and trained.config.export.transfer == "require":
             opinion.require(driven)
         described = {
@@ -130,7 +132,7 @@ def agreeing_forms(
 
     scripted = script(policy)
     content = save(scripted)
-    loaded = load_module(content, policy.in_keys)
+    loaded = load_module(content, policy.in_keys, policy.measures)
     expected = gate.answers(policy, policy, states)
     for stage, found in (
         ("TorchScript is not the artifact", gate.answers(scripted, policy, states)),
@@ -197,22 +199,32 @@ def write(
 
 
 def _second_opinion(
-    content: bytes, policy: DeployablePolicy, trained: TrainedPolicy, report: Callable[[str, str], None]
+    content: bytes,
+    policy: DeployablePolicy,
+    trained: TrainedPolicy,
+    episodes: int,
+    report: Callable[[str, str], None],
 ) -> transfer.Opinion | None:
     """Ask the other engine; None where it cannot be asked and need not be."""
     try:
-        opinion = transfer.ask(content, policy, trained, TRANSFER_EPISODES, SEED)
+        opinion = transfer.ask(content, policy, trained, episodes, SEED)
     except UserError as error:
         if trained.config.export.transfer == "require":
             raise
         report("drives in the other engine", f"not asked: {error}")
         return None
-    there = opinion.evaluation
     name = f"drives in {opinion.physics['_target_'].rpartition('.')[2].removesuffix('Physics')}"
-    report(name, f"reaches {there.success_rate:.1%} of {opinion.episodes:,} goals, stays at {there.settled_rate:.1%}")
+    report(name, f"{opinion.episodes:,} episodes: {_how_well(opinion.evaluation)}")
     for difference in opinion.differences:
         report("", difference)
     return opinion
+
+
+def _how_well(driven: Evaluation) -> str:
+    if not driven.mean_error:
+        return f"reaches {driven.success_rate:.1%} of the goals, stays at {driven.settled_rate:.1%}"
+    off = ", ".join(f"{mean:.3f} {unit}" for mean, unit in driven.mean_error.values())
+    return f"fails in {float(driven.crashed.double().mean()):.1%}, is off by {off}"
 
 
 def _load_as_a_robot_would(content: bytes) -> Metadata:

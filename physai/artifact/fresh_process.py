@@ -21,7 +21,8 @@ def main(policy: str, inputs: str, outputs: str) -> None:
         row = {key: column[index : index + 1] for key, column in columns.items()}
         answer = module(**row)
         answers = answer if isinstance(answer, tuple) else (answer,)
-        rows.append((*answers, module.error(row["joint_position"], row["goal"])))
+        error = (module.error(row["joint_position"], row["goal"]),) if hasattr(module, "error") else ()
+        rows.append((*answers, *error))
     np.savez(outputs, *(torch.cat(column).numpy() for column in zip(*rows)))  # noqa: B905
 
 

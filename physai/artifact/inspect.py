@@ -48,9 +48,9 @@ def _read_onnx(path: Path) -> Metadata:
 
 def _summary(path: Path, metadata: Metadata) -> Table:
     raw = metadata.raw
-    evaluation = raw["evaluation"]
+    evaluation, tip = raw["evaluation"], raw["robot"]["end_effector"]
     rows = {
-        "robot": f"{metadata.robot}, end effector {raw['robot']['end_effector']}",
+        "robot": f"{metadata.robot}, " + (f"end effector {tip}" if tip else "on legs" if metadata.floats else ""),
         "URDF SHA-256": raw["robot"]["urdf_sha256"],
         "inputs": _shapes(metadata.inputs),
         "outputs": _shapes(metadata.outputs),
@@ -84,7 +84,8 @@ def _transfer(transfer: dict[str, Any] | None) -> dict[str, str]:
 
 def _joints(metadata: Metadata) -> Table:
     table = Table(title="Joints, in the policy's order", title_justify="left")
-    for column in ("joint", "position, rad", "velocity, rad/s", "effort, N m", "command, rad/s"):
+    command = "command, rad from home" if metadata.floats else "command, rad/s"
+    for column in ("joint", "position, rad", "velocity, rad/s", "effort, N m", command):
         table.add_column(column, justify="left" if column == "joint" else "right")
     limits = (metadata.position_limit, metadata.velocity_limit, metadata.effort_limit, metadata.command_limit)
     for name, (lower, upper), velocity, effort, command in zip(metadata.joints, *limits, strict=True):

@@ -4,7 +4,7 @@ import copy
 import io
 import warnings
 import zipfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
@@ -12,12 +12,16 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
 from physai.deploy.archive import METADATA
-from physai.deploy.metadata import LAST_COMMAND, MEMORY, NEW_MEMORY
+from physai.deploy.metadata import ERROR, GOAL, LAST_COMMAND, MEMORY, NEW_MEMORY, POSITION
 from physai.envs.make import TransformedRobotEnv
 from physai.errors import UserError
 from physai.signals import Quantity, Signal
 
 VIEWS = ("observation", "normalized_observation", "features")  # what a policy can see on a robot
+_ERROR = """
+def error(self, joint_position: Tensor, goal: Tensor) -> Tensor:
+    return self.observation.error(joint_position, goal)
+"""
 
 
 class Pipeline(nn.Module):
@@ -47,24 +51,18 @@ class Pipeline(nn.Module):
         self.eval()
 
     @torch.jit.export
-    def views(self, joint_position: Tensor, joint_velocity: Tensor, goal: Tensor) -> list[Tensor]:
+    def views(self, observation: Tensor, features: Tensor) -> list[Tensor]:
         """What the policy can see, in the order of ``VIEWS``, [N, ...] each."""
-        observation, features = self.observation(joint_position, joint_velocity, goal)
         return [observation, self.normalizer(observation), features]
-
-    @torch.jit.export
-    def error(self, joint_position: Tensor, goal: Tensor) -> Tensor:
-        """How far the robot is from its goal, one column a tolerance: [N, n] rad and [N, g] to [N, e]."""
-        return self.observation.error(joint_position, goal)
 
 
 class FeedForwardPipeline(Pipeline):
     """A pipeline whose ``network`` maps what it sees, side by side, to actions in [-1, 1]."""
 
     @torch.jit.export
-    def act(self, joint_position: Tensor, joint_velocity: Tensor, goal: Tensor, last_command: Tensor) -> Tensor:
-        """Map what the robot senses, the goal and the last command, [N, ...] each, to commands [N, n]."""
-        views = self.views(joint_position, joint_velocity, goal)
+    def act(self, observation: Tensor, features: Tensor, joint_position: Tensor, last_command: Tensor) -> Tensor:
+        """Map what the task's module makes of a state, and the last command, [N, ...] each, to commands [N, n]."""
+        views = self.views(observation, features)
         action = self.network(torch.cat([views[i] for i in self.seen], dim=1))
         return self.command(action, joint_position, last_command)
 
@@ -77,10 +75,10 @@ class RecurrentPipeline(Pipeline):
 
     @torch.jit.export
     def act(
-        self, joint_position: Tensor, joint_velocity: Tensor, goal: Tensor, last_command: Tensor, memory: Tensor
+        self, observation: Tensor, features: Tensor, joint_position: Tensor, last_command: Tensor, memory: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Map what the robot senses, as without memory, and a memory [N, H] to commands [N, n] and the new memory."""
-        views = self.views(joint_position, joint_velocity, goal)
+        """Map the same as without memory, and a memory [N, H], to commands [N, n] and the new memory."""
+        views = self.views(observation, features)
         action, new_memory = self.network(torch.cat([views[i] for i in self.seen], dim=1), memory)
         return self.command(action, joint_position, last_command), new_memory
 
@@ -92,6 +90,11 @@ class DeployablePolicy(TensorDictModuleBase):
         pipeline: What acts, a :class:`Pipeline`.
         inputs: Signals that it takes, in order.
         outputs: Signals that it gives, in order.
+
+    Attributes:
+        senses: Inputs that the task's module takes, in its order.
+        measures: Whether the policy can tell how far its robot is from a goal.
+        answer_keys: Names of all that it gives: its outputs, and the error where it ``measures`` that.
     """
 
     def __init__(self, pipeline: Any, inputs: Sequence[Signal], outputs: Sequence[Signal]) -> None:
@@ -101,6 +104,8 @@ class DeployablePolicy(TensorDictModuleBase):
         self.inputs, self.outputs = tuple(inputs), tuple(outputs)
         self.in_keys, self.out_keys = [signal.name for signal in inputs], [signal.name for signal in outputs]
         self.memory_size = self.outputs[-1].size if self.out_keys[-1] == NEW_MEMORY else 0
+        self.senses, self.measures = [*pipeline.observation.senses, GOAL], pipeline.observation.measures
+        self.answer_keys = [*self.out_keys, *([ERROR] if self.measures else [])]
 
     def __call__(self, *inputs: Any) -> Any:
         """Act on tensors; or on a TensorDict with ``in_keys``, as other TensorDictModules do."""
@@ -113,16 +118,23 @@ class DeployablePolicy(TensorDictModuleBase):
     def forward(self, *inputs: Tensor) -> Tensor | tuple[Tensor, ...]:
         """Map inputs to outputs, [N, ...] each."""
         given = dict(zip(self.in_keys, inputs, strict=True))
-        return self.pipeline.act(*(given[name] for name in self.arguments()))
+        seen = self.pipeline.observation(*(given[name] for name in self.senses))
+        return self.pipeline.act(*seen, *(given[name] for name in self.arguments()))
+
+    def views(self, given: Mapping[str, Tensor]) -> list[Tensor]:
+        """What the policy can see of inputs by name, in the order of ``VIEWS``, [N, ...] each."""
+        views: list[Tensor] = self.pipeline.views(*self.pipeline.observation(*(given[name] for name in self.senses)))
+        return views
 
     def arguments(self) -> list[str]:
-        """Inputs by the order in which the pipeline takes them; a velocity command does not ask for the last one."""
-        last_command = LAST_COMMAND if LAST_COMMAND in self.in_keys else self.in_keys[0]
-        return [*self.in_keys[:3], last_command, *([MEMORY] if self.memory_size else [])]
+        """Inputs that what acts takes beside views; where the last command is none of them, it is not looked at."""
+        last_command = LAST_COMMAND if LAST_COMMAND in self.in_keys else POSITION
+        return [POSITION, last_command, *([MEMORY] if self.memory_size else [])]
 
     def error(self, joint_position: Tensor, goal: Tensor) -> Tensor:
         """How far the robot is from its goal: [N, n] rad and [N, g] to [N, e]."""
-        return self.pipeline.error(joint_position, goal)
+        error: Tensor = self.pipeline.observation.error(joint_position, goal)
+        return error
 
 
 def as_tuple(answer: Tensor | tuple[Tensor, ...]) -> tuple[Tensor, ...]:
@@ -134,9 +146,8 @@ def make_deployable(actor: TensorDictModuleBase, env: TransformedRobotEnv) -> De
     """Put a trained actor and the env that it was trained in together.
 
     Raises:
-        UserError: If the policy sees what no robot can tell it, or the robot's base floats.
+        UserError: If the policy sees what no robot can tell it.
     """
-    env.simulation.spec.need_fixed_base("a policy file (export.formats) for")
     simulation, memory_size = env.simulation, getattr(actor, "memory_size", 0)
     keys = actor.seen_keys if memory_size else actor.in_keys
     for key in keys:
@@ -156,20 +167,23 @@ def make_deployable(actor: TensorDictModuleBase, env: TransformedRobotEnv) -> De
 
 
 def script(policy: DeployablePolicy) -> torch.jit.ScriptModule:
-    """Compile to TorchScript, with a ``forward`` that takes the policy's inputs by name.
+    """Compile to TorchScript, with a ``forward`` that takes the policy's inputs by name, and maybe an ``error``.
 
     Raises:
         UserError: If a part of the policy is no TorchScript; it says what.
     """
     inputs = ", ".join(f"{name}: Tensor" for name in policy.in_keys)
     answer = "Tuple[Tensor, Tensor]" if policy.memory_size else "Tensor"
-    call = f"return self.act({', '.join(policy.arguments())})"
+    see = f"observation, features = self.observation({', '.join(policy.senses)})"
+    act = f"return self.act(observation, features, {', '.join(policy.arguments())})"
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", DeprecationWarning)
             scripted = torch.jit.script(policy.pipeline)
             if not hasattr(scripted, "forward"):  # of another policy of this type
-                scripted.define(f"def forward(self, {inputs}) -> {answer}:\n    {call}\n")
+                scripted.define(f"def forward(self, {inputs}) -> {answer}:\n    {see}\n    {act}\n")
+                if policy.measures:
+                    scripted.define(_ERROR)
             return scripted
     except Exception as error:  # the compiler's errors have no base class of their own
         reason = " ".join(str(error).split())[:160]

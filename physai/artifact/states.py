@@ -10,9 +10,9 @@ from torch import Tensor
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from physai.artifact.module import DeployablePolicy
-from physai.deploy.metadata import LAST_COMMAND, MEMORY
+from physai.deploy.metadata import GOAL, LAST_COMMAND, MEMORY, POSITION, VELOCITY
 from physai.envs.make import TransformedRobotEnv
-from physai.signals import Quantity
+from physai.signals import Quantity, Signal
 
 ON_POLICY = 1024
 _STEPS = 64
@@ -48,7 +48,7 @@ def roll_out(actor: TensorDictModuleBase, env: TransformedRobotEnv) -> TensorDic
 
 
 def extreme_states(policy: DeployablePolicy, env: TransformedRobotEnv) -> States:
-    """Corners of the joint limits, far goals and huge velocities, each with each; memories from empty to full."""
+    """Corners of the joint limits, far goals and huge velocities, each with each; of all else, from end to end."""
     spec, region = env.simulation.spec, env.simulation.task.region
     low, high = torch.from_numpy(spec.position_limit).clamp(-_TURNS, _TURNS).T
     speed = torch.from_numpy(spec.velocity_limit)
@@ -61,11 +61,21 @@ def extreme_states(policy: DeployablePolicy, env: TransformedRobotEnv) -> States
     poses = torch.cat([torch.stack([low, torch.zeros_like(low), high]), low.diag(), high.diag()])
     rows = list(itertools.product(poses, speeds, goals))
     sensed = [torch.stack(list(column)).float() for column in zip(*rows, strict=True)]
-    states = States(zip(policy.in_keys, sensed, strict=False))
+    known = dict(zip((POSITION, VELOCITY, GOAL), sensed, strict=True))
     # From one side to the other, and from empty to full; the middle among them.
     sweep = torch.linspace(-1, 1, 7).repeat(-(-len(rows) // 7))[: len(rows), None]
-    if LAST_COMMAND in policy.in_keys:
-        states[LAST_COMMAND] = states["joint_position"] + _AHEAD * sweep
-    if policy.memory_size:
-        states[MEMORY] = sweep * torch.ones(policy.memory_size)
-    return states
+    known[LAST_COMMAND] = known[POSITION] + _AHEAD * sweep
+    known[MEMORY] = sweep * torch.ones(policy.memory_size)
+    for signal in policy.inputs:
+        if signal.name not in known:
+            known[signal.name] = _swept(signal, sweep)
+    return States({key: known[key] for key in policy.in_keys})
+
+
+def _swept(signal: Signal, sweep: Tensor) -> Tensor:
+    """Values of a signal between its ends, or where it has none between -100 and 100, [S, ...]; of unit length."""
+    low, high = (torch.from_numpy(end).clamp(-_FAST, _FAST).float() for end in signal.bounds)
+    if signal.quantity is Quantity.DIRECTION:
+        angles = torch.pi * sweep * torch.arange(1, signal.size + 1)
+        return torch.nn.functional.normalize(torch.cos(angles) + 0.1, dim=1)
+    return low + (sweep + 1) / 2 * (high - low)

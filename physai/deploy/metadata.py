@@ -15,7 +15,7 @@ from physai.signals.region import REGIONS
 
 FORMAT = "physai.policy"
 FORMAT_VERSION = 3
-GOAL = "goal"
+POSITION, VELOCITY, GOAL = "joint_position", "joint_velocity", "goal"  # which every policy takes
 LAST_COMMAND = "last_command"  # what was sent before: an input of policies that command positions
 MEMORY, NEW_MEMORY = "memory", "new_memory"  # of a policy that remembers: a further input, a further output
 ERROR = "error"  # how far the robot is from a goal, which the controller asks for
@@ -51,11 +51,13 @@ class Metadata:
         raw: The JSON object.
         robot: Name of the robot.
         joints: Names of the n joints, in the policy's order; the arrays below follow it.
+        floats: Whether nothing holds its base, which its joints carry as springs; a position command is then how far
+            from home each is to be, whatever it was before.
         home: Rest pose, rad, [n].
         position_limit: rad, [n, 2]; infinite for continuous joints.
         velocity_limit: rad/s, [n].
         effort_limit: N·m, [n].
-        command_limit: How fast an action of 1 moves each joint, rad/s, [n].
+        command_limit: How fast an action of 1 moves each joint, rad/s, [n]; of a base that floats, how far, rad.
         control_rate: Hz.
         inputs: What the policy takes, in order.
         outputs: What it gives, in order; first the command.
@@ -72,6 +74,7 @@ class Metadata:
     raw: dict[str, Any]
     robot: str
     joints: tuple[str, ...]
+    floats: bool
     home: np.ndarray
     position_limit: np.ndarray
     velocity_limit: np.ndarray
@@ -96,6 +99,11 @@ class Metadata:
     def command(self) -> Signal:
         """What the robot is told."""
         return self.outputs[0]
+
+    @property
+    def measures(self) -> bool:
+        """Whether the policy can tell from joint positions how far its robot is from a goal."""
+        return ERROR in self.golden
 
     @property
     def memory_size(self) -> int:
@@ -129,7 +137,8 @@ class Metadata:
             raise PolicyError("metadata: limits.position must be pairs of lower and upper limit")
         inputs = tuple(_signal(raw, key) for key in _items(raw, "inputs", 32, "signals"))
         outputs = tuple(_signal(raw, key) for key in _items(raw, "outputs", 32, "signals"))
-        _check_signals(inputs, outputs, tuple(joints))
+        floats = _get(raw, "robot.base", str) == "floating" if "base" in raw["robot"] else False
+        _check_signals(inputs, outputs, tuple(joints), floats)
         goal = next(signal for signal in inputs if signal.name == GOAL)
         region, tolerances = _asked(raw, goal)
         for key, kind in _FOR_PEOPLE.items():
@@ -138,11 +147,13 @@ class Metadata:
         if not 0 < pairs <= MAX_PAIRS:
             raise PolicyError(f"metadata: there are {pairs:,} golden pairs, not 1 to {MAX_PAIRS:,}")
         shapes = {signal.name: (pairs, *signal.shape) for signal in (*inputs, *outputs)}
-        shapes[ERROR] = (pairs, len(tolerances))
+        if ERROR in raw["golden"] or not floats:
+            shapes[ERROR] = (pairs, len(tolerances))
         found = cls(
             raw=raw,
             robot=_get(raw, "robot.name", str),
             joints=tuple(joints),
+            floats=floats,
             home=_array(raw, "robot.home", (n,)),
             position_limit=position,
             velocity_limit=_positive(raw, "limits.velocity", (n,)),
@@ -158,7 +169,7 @@ class Metadata:
             golden={key: _array(raw, f"golden.{key}", shape, kind=np.float32) for key, shape in shapes.items()},
             content_sha256=_get(raw, "content_sha256", str),
         )
-        if not (found.command_limit <= found.velocity_limit).all():
+        if not floats and not (found.command_limit <= found.velocity_limit).all():
             raise PolicyError("metadata: limits.command must not be beyond limits.velocity")
         if _get(raw, "metadata_sha256", str) != metadata_sha256(raw):
             raise PolicyError("the metadata is not what was exported (metadata_sha256 differs)")
@@ -263,7 +274,9 @@ def _bounds(raw: dict[str, Any], key: str, size: int, infinite: float) -> tuple[
     return tuple(_array(raw, key, (size,), null=infinite).tolist()) if _get(raw, key, list) else ()
 
 
-def _check_signals(inputs: tuple[Signal, ...], outputs: tuple[Signal, ...], joints: tuple[str, ...]) -> None:
+def _check_signals(
+    inputs: tuple[Signal, ...], outputs: tuple[Signal, ...], joints: tuple[str, ...], floats: bool
+) -> None:
     """See that a robot's policy takes and gives what a robot's policy must."""
     names = [signal.name for signal in (*inputs, *outputs)]
     if len(set(names)) != len(names) or ERROR in names:
@@ -271,9 +284,11 @@ def _check_signals(inputs: tuple[Signal, ...], outputs: tuple[Signal, ...], join
     command, *memory = outputs
     if command.quantity not in _COMMANDS or command.name != f"{command.quantity.value}_command":
         raise PolicyError("metadata: the first of outputs must be a command of joint velocities or positions")
-    wanted: dict[str, Quantity | None] = {"joint_position": Quantity.JOINT_POSITION, GOAL: None}
-    wanted["joint_velocity"] = Quantity.JOINT_VELOCITY
-    if command.quantity is Quantity.JOINT_POSITION:
+    wanted: dict[str, Quantity | None] = {POSITION: Quantity.JOINT_POSITION, GOAL: None}
+    wanted[VELOCITY] = Quantity.JOINT_VELOCITY
+    if floats and command.quantity is not Quantity.JOINT_POSITION:
+        raise PolicyError("metadata: robot.base: one that floats needs a command of joint positions")
+    if command.quantity is Quantity.JOINT_POSITION and not floats:
         wanted[LAST_COMMAND] = Quantity.JOINT_POSITION
     by_name = {signal.name: signal for signal in inputs}
     for name, quantity in wanted.items():

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from physai.deploy import archive
-from physai.deploy.metadata import ERROR, GOAL, Metadata, PolicyError
+from physai.deploy.metadata import ERROR, GOAL, POSITION, Metadata, PolicyError
 
 if TYPE_CHECKING:
     from tensordict.nn import TensorDictModule
@@ -57,7 +57,7 @@ class Policy:
         self._arrays = [np.zeros((1, *signal.shape), np.float32) for signal in metadata.inputs]
         self._tensors = [torch.from_numpy(array) for array in self._arrays]
         names = [signal.name for signal in metadata.inputs]
-        self._position, self._goal = names.index("joint_position"), names.index(GOAL)
+        self._position, self._goal = names.index(POSITION), names.index(GOAL)
         self._remembers = metadata.memory_size > 0
 
     def __call__(self, *inputs: Vector) -> Any:
@@ -79,8 +79,10 @@ class Policy:
         """How far the robot is from a goal at joint positions [n] rad, one error for each tolerance, [e].
 
         Raises:
-            ValueError: If one of them has another length.
+            ValueError: If one of them has another length, or the policy does not measure that.
         """
+        if not self.metadata.measures:
+            raise ValueError("this policy cannot tell from joint positions how far its robot is from a goal")
         _fill(self._arrays[self._position], joint_position)
         _fill(self._arrays[self._goal], goal)
         return self.module.error(self._tensors[self._position], self._tensors[self._goal])[0].numpy()
@@ -143,7 +145,7 @@ def load_policy(path: str | Path, sha256: str | None = None, expect_joints: Sequ
         raise PolicyError(f"{path}: a policy {how}: {list(metadata.joints)}, not {list(joints)}")
     try:
         inputs = [signal.name for signal in metadata.inputs]
-        policy = Policy(load_module(checked.content, inputs), metadata, digest)
+        policy = Policy(load_module(checked.content, inputs, metadata.measures), metadata, digest)
         policy.golden_error = _golden_error(policy)
     except PolicyError as error:
         raise PolicyError(f"{path}: {error}") from error
@@ -170,12 +172,13 @@ def _described(path: Path, checked: archive.Archive) -> Metadata:
     return metadata
 
 
-def load_module(content: bytes, inputs: Sequence[str]) -> torch.jit.ScriptModule:
+def load_module(content: bytes, inputs: Sequence[str], measures: bool) -> torch.jit.ScriptModule:
     """Load the TorchScript of a policy file that has been checked, or that is not written yet.
 
     Args:
         content: Of the file.
         inputs: What the policy takes.
+        measures: Whether it can tell how far a robot is from a goal.
 
     Raises:
         PolicyError: If its methods are not those of a policy.
@@ -184,7 +187,7 @@ def load_module(content: bytes, inputs: Sequence[str]) -> torch.jit.ScriptModule
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)  # of TorchScript
         module = torch.jit.load(io.BytesIO(content), map_location="cpu").eval()
-        for method, arguments in (("forward", inputs), (ERROR, ("joint_position", GOAL))):
+        for method, arguments in (("forward", inputs), *([(ERROR, (POSITION, GOAL))] if measures else [])):
             found = [a.name for a in getattr(module, method).schema.arguments[1:]] if hasattr(module, method) else None
             if found != list(arguments):
                 raise PolicyError(f"its {method} takes {found}, not {list(arguments)}")
@@ -192,7 +195,7 @@ def load_module(content: bytes, inputs: Sequence[str]) -> torch.jit.ScriptModule
         held = {s.data_ptr() or -place: s.nbytes() for place, s in enumerate(storages)}  # parts may share them
         if sorted(held.values()) != sorted(archive.tensor_sizes(content)):
             raise PolicyError("its weights are shorter or longer than it says")
-        return torch.jit.freeze(module, preserved_attrs=[ERROR])
+        return torch.jit.freeze(module, preserved_attrs=[ERROR] if measures else [])
 
 
 def _golden_error(policy: Policy) -> float:
@@ -204,7 +207,8 @@ def _golden_error(policy: Policy) -> float:
         answer = policy(*inputs)
         answers = answer if metadata.memory_size else (answer,)
         found = {signal.name: one for signal, one in zip(metadata.outputs, answers, strict=True)}
-        found[ERROR] = policy.error(pair["joint_position"], pair[GOAL])
+        if metadata.measures:
+            found[ERROR] = policy.error(pair[POSITION], pair[GOAL])
         for key, given in found.items():
             expected = pair[key]
             if given.shape != expected.shape or given.dtype != np.float32:

@@ -159,7 +159,7 @@ class Simulation:
             ends = np.full((2, len(spec.joints)), [[-1.0], [1.0]])
             signals.append(Signal.of_joints("last_action", Quantity.ACTION, spec.joints, *ends))
         if "clock" in self.task.module.senses:
-            signals.append(Signal("clock", Quantity.TIME, (1,)))
+            signals.append(Signal("clock", Quantity.TIME, (1,), (0.0,), (self.task.module.period,)))
         if self.joint_command.moves_on:
             command = spec.joint_command
             last = Signal("last_command", command.quantity, command.shape, command.low, command.high, command.labels)
@@ -175,7 +175,7 @@ class Simulation:
             "goal": self.goal,
             "last_action": self.last_action,
             "last_command": self.last_command,
-            "clock": self.episode_length * self.config.control_dt,
+            "clock": np.mod(self.episode_length * self.config.control_dt, self.task.module.period),
         }
         if state.base_pose is not None and state.base_twist is not None:
             turn = state.base_pose[:, 3:]

@@ -139,6 +139,8 @@ class RobotSpec:
     def joint_command(self) -> Signal:
         """What it is driven by."""
         limit, (lower, upper) = self.command_limit, self.position_limit.T
+        if self.offset:
+            lower, upper = np.maximum(lower, self.home - limit), np.minimum(upper, self.home + limit)
         bounds = (-limit, limit) if self.command is Quantity.JOINT_VELOCITY else (lower, upper)
         return Signal.of_joints(f"{self.command.value}_command", self.command, self.joints, *bounds)
 

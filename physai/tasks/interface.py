@@ -1,5 +1,6 @@
 """What a task is: a goal, what a policy sees of it, and how a step is judged."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar, Protocol
@@ -21,10 +22,14 @@ class ObservationModule(nn.Module):
             (:attr:`physai.envs.simulation.Simulation.senses`); the goal comes after them.
         suggests: Whether the last n features are the latent actions of a controller without learning, to which a
             :class:`physai.policies.ResidualActor` adds.
+        measures: Whether ``error`` tells from joint positions how far the robot is from its goal.
+        period: After which the ``clock`` begins again, s, where one is sensed.
     """
 
     senses: tuple[str, ...] = ("joint_position", "joint_velocity")
     suggests: bool = False
+    measures: bool = True
+    period: float = math.inf
 
     def forward(self, joint_position: Tensor, joint_velocity: Tensor, goal: Tensor) -> tuple[Tensor, Tensor]:
         """Map positions [N, n] rad, velocities [N, n] rad/s and goals [N, g] to observation and features.

@@ -53,10 +53,11 @@ class WalkObservation(ObservationModule):
 
     senses = ("angular_velocity", "gravity", "joint_position", "joint_velocity", "last_action", "clock")
     suggests = True
+    measures = False
 
     def __init__(self, spec: RobotSpec, gait: Gait) -> None:
         super().__init__()
-        self.frequency, self.still = gait.frequency, _STILL
+        self.frequency, self.still, self.period = gait.frequency, _STILL, 1.0 / gait.frequency
         self.home: Tensor
         self.phase: Tensor
         self.lift: Tensor

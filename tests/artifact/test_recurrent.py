@@ -35,7 +35,7 @@ def test_over_a_thousand_steps_each_form_remembers_as_the_policy_does(trained, r
     expected = gate.unroll(gate.acting(actor, env), policy, work)
     assert {key: value.shape for key, value in expected.items()} == {COMMAND: (1000, 2), "new_memory": (1000, SIZE)}
     assert expected["new_memory"][-1].abs().max() > 0.1  # there is something to remember
-    found = gate.unroll(load_module(content, KEYS), policy, work)
+    found = gate.unroll(load_module(content, KEYS, policy.measures), policy, work)
     assert all(torch.equal(found[key], expected[key]) for key in expected)
     runtime = onnx.Runtime((recurrent_run / "policy.onnx").read_bytes())
     found = gate.unroll(runtime, policy, work)
