@@ -1,16 +1,13 @@
 """A policy that is asked with care: it is a foreign program, and what it answers is looked at before anything moves."""
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from physai.deploy.metadata import GOAL, LAST_COMMAND, MEMORY
 from physai.deploy.policy import Driver
 from physai.errors import UserError
-
-KNOWN = ("joint_position", "joint_velocity", GOAL, LAST_COMMAND, MEMORY)  # what a controller can tell a policy
 
 
 class AnswerError(Exception):
@@ -27,6 +24,7 @@ class CheckedPolicy:
     Args:
         policy: From :func:`physai.deploy.load_policy`.
         stopwatch: Measures how long it takes, s.
+        known: Names of what the controller can tell it.
 
     Attributes:
         nothing: What it remembers when an episode begins: zeros, [H].
@@ -35,17 +33,21 @@ class CheckedPolicy:
         UserError: If the policy takes an input that a controller cannot tell it.
     """
 
-    def __init__(self, policy: Driver, stopwatch: Callable[[], float]) -> None:
+    def __init__(self, policy: Driver, stopwatch: Callable[[], float], known: Sequence[str]) -> None:
         metadata = policy.metadata
         self._policy, self._stopwatch = policy, stopwatch
         self._inputs = [signal.name for signal in metadata.inputs]
         for name in self._inputs:
-            if name not in KNOWN:
-                raise UserError(f"the policy takes '{name}': this controller can tell {', '.join(KNOWN)}")
+            if name not in known:
+                raise UserError(f"the policy takes '{name}': this controller can tell {', '.join(known)}")
         self._command = metadata.command.shape
         self._errors = (len(metadata.tolerances),)
         self.nothing = np.zeros(metadata.memory_size, np.float32)
         self._started = 0.0
+
+    def start(self) -> None:
+        """Measure from now on how long the policy takes."""
+        self._started = self._stopwatch()
 
     def error(self, position: np.ndarray, goal: np.ndarray) -> list[float]:
         """Return how far joint positions [n], rad, are from a goal [g]: E numbers in the units of the tolerances.
@@ -53,7 +55,7 @@ class CheckedPolicy:
         Raises:
             AnswerError: If the policy cannot say.
         """
-        self._started = self._stopwatch()
+        self.start()
         array = self._call(lambda: np.asarray(self._policy.error(position, goal), dtype=np.float64))
         error: list[float] = array.tolist()  # so few numbers are quicker without arrays
         if array.shape != self._errors or not all(0 <= each < math.inf for each in error):
@@ -64,8 +66,7 @@ class CheckedPolicy:
         """Return the command, [n], and the memory, [H], for what is known, by name.
 
         Raises:
-            AnswerError: If they cannot be used, or if ``timeout`` s have passed since the policy was asked for the
-                error.
+            AnswerError: If they cannot be used, or if ``timeout`` s have passed since ``start``, which ``error`` calls.
         """
         command, memory = self._call(lambda: self._split(self._policy(*[known[name] for name in self._inputs])))
         took = self._stopwatch() - self._started

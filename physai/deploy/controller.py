@@ -11,19 +11,19 @@ from typing import Any
 import numpy as np
 
 from physai.deploy.checked import AnswerError, CheckedPolicy
+from physai.deploy.clock import Clock
 from physai.deploy.command import Command, State
 from physai.deploy.following import Following, Progress, Strain
 from physai.deploy.goals import Goal, GoalError, accept
 from physai.deploy.guard import CollisionGuard
-from physai.deploy.interfaces import INTERFACES
+from physai.deploy.interfaces import interface_of
 from physai.deploy.joints import Heard, JointReader, JointState, JointStateError
-from physai.deploy.limits import LATE, VelocityLimits, check
-from physai.deploy.metadata import GOAL, LAST_COMMAND, MEMORY
+from physai.deploy.limits import VelocityLimits, check
+from physai.deploy.metadata import GOAL, LAST_COMMAND, MEMORY, POSITION, VELOCITY
 from physai.deploy.parameters import ControllerConfig
 from physai.deploy.policy import Driver
 
-_STILL = 3  # updates in a row at the same time
-_STEP = 0.75  # periods; what is asked again sooner is the same step of a policy that remembers
+STEP = 0.75  # periods; what is asked again sooner is the same step of a policy that remembers
 _MOVED = 0.1  # tolerances; a goal that moves by less is still the same
 
 
@@ -46,6 +46,8 @@ class Controller:
         UserError: If the limits do not fit the robot, or the policy takes what this controller cannot tell it.
     """
 
+    KNOWN: tuple[str, ...] = (POSITION, VELOCITY, GOAL, LAST_COMMAND, MEMORY)  # what it can tell a policy
+
     def __init__(
         self,
         policy: Driver,
@@ -54,9 +56,10 @@ class Controller:
     ) -> None:
         self.policy = policy
         metadata = policy.metadata
-        self._asked = CheckedPolicy(policy, stopwatch)
-        self._interface = INTERFACES[metadata.command.quantity](metadata)
+        self._asked = CheckedPolicy(policy, stopwatch, self.KNOWN)
+        self._interface: Any = interface_of(metadata)
         self._period = 1.0 / metadata.control_rate
+        self._clock = Clock(self._period)
         self._tolerances = [tolerance.value for tolerance in metadata.tolerances]
         self._counters: Counter[str] = Counter()
         self._latched: State | None = None
@@ -66,7 +69,6 @@ class Controller:
         self._progress, self._strain = Progress(), Strain(metadata)
         self.configure(config)
         self._now: float | None = None
-        self._still = 0  # updates in a row at that time
         self._received = -math.inf  # when the robot was heard of: its joint that was not for longest
         self._goal: np.ndarray | None = None
         self._reached = self._guarded = False  # at the goal; held back by the collision guard
@@ -88,6 +90,7 @@ class Controller:
         check(config, self.policy.metadata)
         guard = CollisionGuard(self.policy.metadata, config)
         self.config = config
+        self._clock.jump = config.clock_jump
         self._robot.configure(config)
         self._limits = VelocityLimits(self.policy.metadata, config)
         self._interface.configure(config, self._limits)
@@ -127,6 +130,7 @@ class Controller:
         if joint_state is not None and math.isfinite(now):
             for one in joint_state if isinstance(joint_state, list) else (joint_state,):
                 self._take_state(now, one, not stop, reasons)
+        self._sense(now, reasons)
         if self._received > -math.inf and now - self._received > self.config.state_timeout:
             oldest = self._robot.oldest()
             what = "joint state" if oldest is None else f"state of '{oldest}'"
@@ -147,9 +151,8 @@ class Controller:
             self._counters[f"entered {state.value}"] += 1
         self._memory = memory
         value = self._send(velocity, elapsed, reasons)
-        if value is not None:
-            unheard = state is State.WAITING and self._received == -math.inf
-            value = None if unheard else value.copy()
+        unheard = state is State.WAITING and self._received == -math.inf
+        value = None if unheard or value is None else value.copy()
         self._command = Command(value, state, tuple(reasons))
         return self._command
 
@@ -205,23 +208,13 @@ class Controller:
 
     def _take_time(self, now: float, reasons: list[str]) -> tuple[float, bool]:
         """Return the time since the last update, and whether the arm must stand in this tick."""
-        if not math.isfinite(now):
-            reasons.append(self._hold("clock", "the time is not finite"))
-            return 0.0, True
-        before, self._now = self._now, now
-        elapsed = self._period if before is None else now - before
-        self._still = 0 if elapsed else self._still + 1
-        if self._still >= _STILL:
-            reasons.append(self._hold("clock", "the clock stands still"))
-            return 0.0, True
-        if elapsed < 0 or elapsed > self.config.clock_jump:
-            reasons.append(self._hold("clock", f"the clock jumped by {elapsed:.3f} s"))
-            return 0.0, True
-        if elapsed > LATE * self._period:
-            late = f"update came after {elapsed:.3f} s, {elapsed / self._period:.1f} periods"
+        elapsed, doubt, late = self._clock.take(now)
+        self._now = self._clock.now
+        if doubt:
+            reasons.append(self._hold("clock", doubt))
+        if late:
             self._tell(reasons, "late updates", late)
-            return elapsed, True
-        return elapsed, False
+        return elapsed, bool(doubt or late)
 
     def _take_goal(self, goal: Goal, reasons: list[str]) -> None:
         try:
@@ -276,7 +269,14 @@ class Controller:
             return
         if robot.feels and (beyond := self._strain.heard(self._received, robot.effort, self.config.effort_time)):
             self._fault("effort", beyond)
-        deviation = self._following.heard(self._received, robot.motion)
+        self._check_following()
+
+    def _sense(self, now: float, reasons: list[str]) -> None:
+        """Take what else the robot tells of itself."""
+
+    def _check_following(self) -> None:
+        """See whether the arm does what it is told, and tells what it does."""
+        deviation = self._following.heard(self._received, self._robot.motion)
         if deviation is not None:
             if not deviation.consistent:
                 raise JointStateError("velocity inconsistent", deviation.text, implausible=True)
@@ -335,8 +335,8 @@ class Controller:
                 return self._give_up(error, reasons)
             target = self._interface.begin(robot.position, robot.turned)
             known = {
-                "joint_position": robot.turned,
-                "joint_velocity": robot.velocity,
+                POSITION: robot.turned,
+                VELOCITY: robot.velocity,
                 GOAL: self._goal,
                 MEMORY: self._memory,
                 LAST_COMMAND: self._interface.last_command,
@@ -387,7 +387,7 @@ class Controller:
     def _remember(self, memory: np.ndarray, elapsed: float) -> np.ndarray:
         """Return the new memory, or the old one: who asks more often than in training must not make time run faster."""
         self._step += elapsed
-        if self._step < _STEP * self._period:
+        if self._step < STEP * self._period:
             return self._memory
         self._step -= self._period
         return memory

@@ -1,4 +1,4 @@
-"""What drives a robot, joint velocities or joint positions: what is sent while it drives, and while it stands."""
+"""What drives a robot, joint velocities or positions, or legs: what is sent while it drives, and while it stands."""
 
 import math
 
@@ -157,5 +157,49 @@ class PositionInterface(VelocityInterface):
         return self._target + 2 * math.pi * turns
 
 
-INTERFACES = {Quantity.JOINT_VELOCITY: VelocityInterface, Quantity.JOINT_POSITION: PositionInterface}
-"""By what the policy commands."""
+class StanceInterface(VelocityInterface):
+    """Legs are sent joint positions, which their springs close in on; they stand where they were told to be last.
+
+    Attributes:
+        target: What was sent last, rad, [n]; None where that does not hold any more.
+        drives: Whether the policy wanted that.
+    """
+
+    target: np.ndarray | None = None
+    drives = False
+
+    def configure(self, config: ControllerConfig, limits: VelocityLimits) -> None:
+        """See :class:`VelocityInterface`; none of these matter to legs."""
+
+    def drive(self, velocity: np.ndarray, elapsed: float) -> tuple[np.ndarray, str | None]:
+        """See :class:`VelocityInterface`; go on with positions [n], rad, in the place of velocities."""
+        self.target, self.drives = velocity, True
+        return velocity, None
+
+    def stand(self, position: np.ndarray) -> np.ndarray | None:
+        """See :class:`VelocityInterface`."""
+        self.drives = False
+        if self.target is None and np.isfinite(position).all():
+            self.target = position.copy()
+        return self.target
+
+    def give_way(self, position: np.ndarray) -> np.ndarray | None:
+        """Leave springs without force, so that damping is all that is left; return what to send, [n].
+
+        Args:
+            position: Where the joints are, rad, [n]; NaN where that is not known.
+        """
+        self.target, self.drives = None, False
+        return position.copy() if np.isfinite(position).all() else None
+
+    def standstill(self, position: np.ndarray) -> np.ndarray:
+        """See :class:`VelocityInterface`; what carries a robot must not let go."""
+        return position if self.target is None else self.target
+
+
+def interface_of(metadata: Metadata) -> VelocityInterface:
+    """Return how the robot of a policy is driven."""
+    if metadata.floats:
+        return StanceInterface(metadata)
+    takes_positions = metadata.command.quantity is Quantity.JOINT_POSITION
+    return PositionInterface(metadata) if takes_positions else VelocityInterface(metadata)

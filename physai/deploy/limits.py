@@ -4,11 +4,10 @@ import math
 
 import numpy as np
 
+from physai.deploy.clock import LATE
 from physai.deploy.metadata import Metadata
 from physai.deploy.parameters import ControllerConfig
 from physai.errors import UserError
-
-LATE = 3.0  # control periods; an update that comes later stands still
 
 _ROOM = 1 + 1e-6  # of single precision
 

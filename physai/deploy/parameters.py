@@ -128,4 +128,7 @@ class ControllerConfig(Parameters):
         (), "what stands around: x, y, z of a centre and of half the edges, box by box", "m", -100.0, 100.0
     )
     effort_time: float = parameter(0.5, "an effort beyond its limit for this long is a fault", "s", 0.0, 60.0)
+    command_timeout: float = parameter(0.5, "legs: without a newer velocity command it stands", "s", 0.05, 60.0)
+    rise_time: float = parameter(1.0, "legs: it stands up in this time, then it walks", "s", 0.0, 60.0)
+    max_tilt: float = parameter(0.8, "legs: to lean by more is a fault", "rad", 0.1, 3.1)
     clock_jump: float = parameter(1.0, "an update later than this is a jump of the clock", "s", 0.01, 3600.0)

@@ -12,7 +12,7 @@ from rclpy.exceptions import NameValidationException
 from std_msgs.msg import Bool, String
 from std_srvs.srv import SetBool
 
-from physai.deploy import Command, Controller, ControllerConfig, Driver, Goal, State, load_policy
+from physai.deploy import Command, ControllerConfig, Driver, Goal, State, load_policy, make_controller
 from physai.deploy.goals import GoalError, accept
 from physai.deploy.metadata import describe_goal
 from physai.deploy.parameters import parameter
@@ -24,6 +24,7 @@ from physai.ros.topics import description, goals, qos
 from physai.ros.topics.commands import JointCommands
 from physai.ros.topics.diagnostics import Timing, diagnose, summary
 from physai.ros.topics.emergency_stop import EmergencyStopTopics
+from physai.ros.topics.imu import ImuTopic
 from physai.ros.topics.joint_states import JointStates
 from physai.ros.topics.watched_commands import WatchedCommands
 from physai.signals import Quantity
@@ -72,9 +73,10 @@ class InferenceNode(StoppableNode[InferenceConfig]):
         self._known = time.monotonic() + _DISCOVERY  # when who else commands the robot will surely have been found
         self._arrived = time.monotonic()  # when commands reached the robot, for the last time
         policy = self.load()
-        self._controller = Controller(policy, config)
+        self._controller = make_controller(policy, config)
         self._goal = self.first_goal(policy)
         self._robot = JointStates(self, policy.metadata.joints, self._on_joint_states)
+        self._imu = ImuTopic(self) if policy.metadata.floats else None
         self._command = Command(None, State.WAITING, ())
         self._stop_file = EmergencyStopFile(self.get_fully_qualified_name(), self.context.get_domain_id())
         self._enabled = config.autostart and not self._stop_file.unusable
@@ -95,7 +97,8 @@ class InferenceNode(StoppableNode[InferenceConfig]):
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self._descriptions = self.create_publisher(String, description.TOPIC, qos.LATCHED)
         self._asked = self.create_publisher(String, goals.DESCRIPTION, qos.LATCHED)
-        taken = self.create_subscription(goals.goal_type(policy.metadata.goal), "~/goal", self._take_goal, 1)
+        goal = policy.metadata.goal
+        taken = self.create_subscription(goals.goal_type(goal), goals.topic(goal), self._take_goal, 1)
         self._goal_topic = taken.topic_name
         self._stop_topics = EmergencyStopTopics(self, lambda topic: self._emergency_stop(f"by {topic}"))
         self.create_service(SetBool, "~/enable", self._enable)
@@ -115,8 +118,8 @@ class InferenceNode(StoppableNode[InferenceConfig]):
             self._descriptions.publish(String(data=urdf))
         self._asked.publish(String(data=describe_goal(policy.metadata)))
         self.get_logger().info(
-            f"{config.policy_path} drives {list(policy.metadata.joints)} of '{policy.metadata.robot}', at most "
-            f"{config.max_velocity:g} rad/s; {self._waits_for()}"
+            f"{config.policy_path} drives {list(policy.metadata.joints)} of '{policy.metadata.robot}'"
+            f"{'' if self._imu else f', at most {config.max_velocity:g} rad/s'}; {self._waits_for()}"
         )
 
     def _frames(self) -> str:
@@ -207,16 +210,17 @@ class InferenceNode(StoppableNode[InferenceConfig]):
         now = time.monotonic()
         interlocks = self._interlocks(now)
         goal, self._goal = self._goal, None
-        command = self._controller.update(now, self._robot.take(), goal, interlocks)
+        felt = {} if self._imu is None else {"imu": self._imu.take()}
+        command = self._controller.update(now, self._robot.take(), goal, interlocks, **felt)
         self._publish(command)
         self._forget_old_goal(now)
         before, self._command = self._command, command
-        if goal is not None:
+        if goal is not None and self._imu is None:  # velocities come many times a second
             self.get_logger().info(f"goal {goals.describe(goal, self._controller.policy.metadata.goal)}")
         for reason in command.reasons:
             if reason.startswith("goal"):
                 self.get_logger().warning(reason)
-            elif reason.startswith("joint state rejected"):
+            elif reason.startswith(("joint state rejected", "IMU rejected")):
                 self.get_logger().warning(reason, throttle_duration_sec=1.0)
         if command.state is not before.state or interlocks != self._blocked:
             self._blocked = interlocks

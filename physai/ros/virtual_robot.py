@@ -1,4 +1,4 @@
-"""A simulated arm behind the topics of a ros2_control controller: a real robot's place, without its dangers."""
+"""A simulated robot behind the topics of a ros2_control controller: a real one's place, without its dangers."""
 
 import sys
 import time
@@ -15,6 +15,7 @@ from physai.ros.node.run import StoppableNode, run
 from physai.ros.topics import joint_states, qos
 from physai.ros.topics.commands import controller_topic
 from physai.ros.virtual.arm import GroupController, VirtualArm
+from physai.ros.virtual.base import BaseTopics
 from physai.ros.virtual.faults import FaultConfig, Faults
 
 
@@ -66,6 +67,8 @@ class VirtualRobot(StoppableNode[VirtualRobotConfig]):
         self._controller = GroupController(rest, self._arm.spec.command, config.command_timeout)
         self._faults = Faults(config, config.seed)
         self._states = self.create_publisher(JointStateMessage, joint_states.TOPIC, 10)
+        floats = self._arm.spec.floating is not None
+        self._base = BaseTopics(self, self._arm.spec.base) if floats else None
         commands = controller_topic(self._arm.spec.command)
         self.create_subscription(Float64MultiArray, commands, self._take_command, qos.COMMAND)
         self.offer("~/reset", self._reset)
@@ -102,7 +105,10 @@ class VirtualRobot(StoppableNode[VirtualRobotConfig]):
         for place, joint in self._shown:
             positions[place], velocities[place] = float(position[joint]), float(velocity[joint])
             efforts[place] = float(self._arm.effort[joint])
-        stamp = self.get_clock().now().nanoseconds * 1e-9
+        clock = self.get_clock().now()
+        if self._base is not None and self._arm.base is not None:
+            self._base.publish(self._arm.base, clock)
+        stamp = clock.nanoseconds * 1e-9
         for state in self._faults.apply(JointState(self._names, positions, velocities, stamp, effort=efforts), now):
             message = JointStateMessage(
                 name=state.names, position=state.position, velocity=state.velocity, effort=state.effort

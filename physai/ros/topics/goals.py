@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from builtin_interfaces.msg import Time
-from geometry_msgs.msg import PointStamped, PoseStamped
+from geometry_msgs.msg import PointStamped, PoseStamped, Twist
 from rclpy.node import Node
 from sensor_msgs.msg import JointState
 
@@ -15,12 +15,17 @@ from physai.signals import Quantity, Signal
 DESCRIPTION = "~/goal_description"
 """What goals are, and where they lie: the JSON of :func:`physai.deploy.metadata.describe_goal`, latched."""
 
-_TYPES = {Quantity.POSITION: PointStamped, Quantity.POSE: PoseStamped, Quantity.JOINT_POSITION: JointState}
+_TYPES = {
+    Quantity.POSITION: PointStamped,
+    Quantity.POSE: PoseStamped,
+    Quantity.JOINT_POSITION: JointState,
+    Quantity.TWIST: Twist,
+}
 _POSITION, _ORIENTATION = ("x", "y", "z"), ("x", "y", "z", "w")
 
 
 def goal_type(signal: Signal) -> Any:
-    """Return the message type of a goal signal: PointStamped, PoseStamped or JointState.
+    """Return the message type of a goal signal: PointStamped, PoseStamped, JointState or Twist.
 
     Raises:
         UserError: If there is none for its quantity.
@@ -30,10 +35,17 @@ def goal_type(signal: Signal) -> Any:
     return _TYPES[signal.quantity]
 
 
+def topic(signal: Signal) -> str:
+    """Name the topic of a goal signal, within those of its node."""
+    return "~/cmd_vel" if signal.quantity is Quantity.TWIST else "~/goal"
+
+
 def from_message(message: Any, signal: Signal) -> Goal:
     """Take a goal out of a message of ``goal_type``."""
     if signal.quantity is Quantity.JOINT_POSITION:
         return Goal(message.position.tolist(), names=tuple(message.name))
+    if signal.quantity is Quantity.TWIST:  # which has no frame: it is that of the base
+        return Goal([message.linear.x, message.linear.y, message.angular.z], signal.frame)
     if signal.quantity is Quantity.POSE:
         position, orientation = message.pose.position, message.pose.orientation
         value = [getattr(position, axis) for axis in _POSITION] + [getattr(orientation, axis) for axis in _ORIENTATION]
@@ -44,6 +56,9 @@ def from_message(message: Any, signal: Signal) -> Goal:
 def to_message(value: Sequence[float], signal: Signal, stamp: Time) -> Any:
     """Put a goal, numbers in the signal's order, into a message of ``goal_type``."""
     message = goal_type(signal)()
+    if signal.quantity is Quantity.TWIST:
+        message.linear.x, message.linear.y, message.angular.z = map(float, value)
+        return message
     message.header.stamp = stamp
     if signal.quantity is Quantity.JOINT_POSITION:
         message.name, message.position = list(signal.labels), [float(number) for number in value]

@@ -1,7 +1,8 @@
-"""The arm of the virtual robot, and the controller below it; no ROS in here."""
+"""The arm or the legs of the virtual robot, and the controller below; no ROS in here."""
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -11,6 +12,9 @@ from physai.config import nearest, validate
 from physai.envs.simulation import EnvConfig
 from physai.errors import UserError
 from physai.physics import ActuatorDelay, ParameterLayout, Physics, RandomizationConfig, RobotState, SensorErrors
+from physai.physics.interface import at_home
+from physai.physics.rotation import product, rotate_back, shortest
+from physai.physics.sensing import ImuErrors
 from physai.robots import RobotSpec
 from physai.seeding import derive
 from physai.signals import Quantity
@@ -55,8 +59,27 @@ class GroupController:
         return self._rest if over and self._stops else self._command
 
 
+@dataclass(frozen=True)
+class Base:
+    """A base that floats: what it truly does, and what its IMU says.
+
+    Attributes:
+        pose: x, y, z in the world, m, then a quaternion x, y, z, w, [7].
+        velocity: Along its own axes, m/s, [3].
+        rate: About them, rad/s, [3].
+        told_orientation: Quaternion, by the IMU, [4].
+        told_rate: rad/s, by the IMU, [3].
+    """
+
+    pose: np.ndarray
+    velocity: np.ndarray
+    rate: np.ndarray
+    told_orientation: np.ndarray
+    told_rate: np.ndarray
+
+
 class VirtualArm:
-    """One simulated arm as its sensors show it, with the dynamics, delay and sensor errors of a randomization config.
+    """One simulated robot as its sensors show it, with the dynamics, delay and sensor errors of a randomization config.
 
     Args:
         env: A file of ``conf/env``, or the path of another.
@@ -68,6 +91,7 @@ class VirtualArm:
 
     Attributes:
         effort: What its motors gave in the last step, N·m, [n].
+        base: What a base that floats does; None of one that is fixed.
 
     Raises:
         UserError: If there is no such config.
@@ -94,8 +118,9 @@ class VirtualArm:
             raise UserError(f"physics: '{physics}' is no engine that could simulate a robot")
         draws = validate(RandomizationConfig, node.randomization)
         self.spec = RobotSpec.from_config(config.robot)
-        self.spec.need_fixed_base("a virtual")
-        self._physics: Physics = make("physics", config.physics, self.spec, 1, period, needs=("reset", "step", "close"))
+        substeps = max(1, math.ceil(config.substeps * period / config.control_dt - 1e-9))
+        sizes = 1, period, substeps
+        self._physics: Physics = make("physics", config.physics, self.spec, *sizes, needs=("reset", "step", "close"))
         layout = ParameterLayout(self.spec)
         draws.check(layout)
         self._parameters = draws.sample(1, layout, torch.Generator().manual_seed(derive(seed, "virtual robot")))
@@ -104,6 +129,7 @@ class VirtualArm:
         self._steps = np.array([round(delay * config.control_dt / period)])
         self._delay = ActuatorDelay(1, len(self.spec.joints))
         self._errors = SensorErrors(layout)
+        self._imu = ImuErrors(layout) if self.spec.floating is not None else None
         self._random = torch.Generator().manual_seed(derive(seed, "sensors"))
         takes_positions = self.spec.command is Quantity.JOINT_POSITION
         self.rest = self.spec.home if takes_positions else np.zeros_like(self.spec.home)
@@ -111,10 +137,11 @@ class VirtualArm:
 
     def reset(self) -> None:
         """Stand still at home."""
-        home, row = self.spec.home[None], np.zeros(1, dtype=int)
-        self._physics.reset(row, RobotState(home, np.zeros_like(home)), self._dynamics)
+        home, row = at_home(self.spec, 1), np.zeros(1, dtype=int)
+        self._physics.reset(row, home, self._dynamics)
         self._delay.reset(row, self.rest[None], self._steps)
-        self.effort = np.zeros_like(home[0])
+        self.effort = np.zeros_like(self.spec.home)
+        self.base = self._base(home)
 
     def step(self, command: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Hold a command [n], rad/s or rad, for a period; return what the sensors say, rad [n] and rad/s [n]."""
@@ -123,7 +150,22 @@ class VirtualArm:
         position, velocity = self._errors(*true, self._parameters.double(), self._random)
         assert state.joint_effort is not None
         self.effort = state.joint_effort[0]
+        self.base = self._base(state)
         return position[0].numpy(), velocity[0].numpy()
+
+    def _base(self, state: RobotState) -> Base | None:
+        if self._imu is None:
+            return None
+        assert state.base_pose is not None
+        assert state.base_twist is not None
+        turn, twist = state.base_pose[:, 3:], state.base_twist
+        velocity, rate, down = (
+            rotate_back(turn, vector) for vector in (twist[:, :3], twist[:, 3:], np.array([[0.0, 0.0, -1.0]]))
+        )
+        true = torch.from_numpy(rate), torch.from_numpy(down)
+        told_rate, told_down = (each.numpy() for each in self._imu(*true, self._parameters.double(), self._random))
+        told = product(turn, shortest(told_down, down))
+        return Base(state.base_pose[0].copy(), velocity[0], rate[0], told[0], told_rate[0])
 
     def close(self) -> None:
         """Free the physics engine."""
