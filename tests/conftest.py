@@ -198,6 +198,13 @@ def panda_run(once: Callable[[str, Callable[[Path], None]], Path]) -> Path:
     return once("panda_run", partial(_train_and_export, "env=panda_reach", "physics=mujoco", "total_frames=320_000"))
 
 
+@pytest.fixture(scope="session")
+def walking_run(once: Callable[[str, Callable[[Path], None]], Path]) -> Path:
+    """A run of a robot on legs; short, for it walks from the first frame on."""
+    short = ("total_frames=12_288", "env.task.max_steps=100", "evaluation.goals=20")
+    return once("walking_run", partial(_train_and_export, "env=a1_walk", "physics=mujoco", *short))
+
+
 def _train_and_export(*arguments: Any) -> None:
     *overrides, run = arguments
     node = compose("train", [*overrides, "evaluation.episodes=200", "evaluation.in_a_row=2"])

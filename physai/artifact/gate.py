@@ -84,7 +84,6 @@ def outputs(function: Function, policy: DeployablePolicy, states: States) -> Ans
 def answers(form: Any, policy: DeployablePolicy, states: States) -> Answers:
     """What a form of a policy, eager or scripted, gives for S states, one by one."""
 
-
     def answer(row: States) -> tuple[Tensor, ...]:
         told = as_tuple(form(*row.values()))
         return (*told, form.error(row[POSITION], row[GOAL])) if policy.measures else told

@@ -80,7 +80,8 @@ class ImuReader:
         Raises:
             ImuError: If it cannot be used, and why.
         """
-        orientation, turns = (to_floats(getattr(imu, key, None)) for key in ("orientation", "angular_velocity"))
+        told = (imu.orientation, imu.angular_velocity) if isinstance(imu, Imu) else ("", "")
+        orientation, turns = map(to_floats, told)
         if orientation is None or turns is None or orientation.shape != (4,) or turns.shape != (3,):
             raise ImuError("malformed", "it does not hold four and three numbers")
         if not (np.isfinite(orientation).all() and np.isfinite(turns).all()):
@@ -103,10 +104,11 @@ class ImuReader:
         if (fastest := float(np.abs(turns).max())) > _FASTEST:
             raise ImuError("implausible", f"an angular velocity of {fastest:.0f} rad/s cannot be true", True)
         gravity = _down(orientation / length)
-        if speed < _MOVES or not (np.array_equal(gravity, self.gravity) and np.array_equal(turns, self.angular_velocity)):
+        same = np.array_equal(gravity, self.gravity) and np.array_equal(turns, self.angular_velocity)
+        if speed < _MOVES or not same:
             self._changed = received
-        elif received - self._changed > self.timeout:
-            raise ImuError("frozen", f"it has told the same for {received - self._changed:.2f} s, and joints move", True)
+        elif (frozen := received - self._changed) > self.timeout:
+            raise ImuError("frozen", f"it has told the same for {frozen:.2f} s, and joints move", implausible=True)
         self.gravity, self.angular_velocity, self.received = gravity, turns, received
 
 

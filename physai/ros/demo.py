@@ -6,9 +6,8 @@ import sys
 import tempfile
 from contextlib import ExitStack, closing
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import torch
 from omegaconf import DictConfig
 from rich.console import Console
 
@@ -18,7 +17,10 @@ from physai.config import Config, Count, PositiveFloat, Seed, validate
 from physai.deploy import ControllerConfig, load_policy, read_metadata
 from physai.deploy.limits import smallest_margin
 from physai.errors import UserError
-from physai.ros.driving.policies import newest_policies, robot_overrides
+from physai.ros.driving.policies import newest_policies, robot_engine, robot_overrides
+
+if TYPE_CHECKING:
+    from physai.ros.driving.client import Client
 
 
 class DemoConfig(Config):
@@ -67,9 +69,9 @@ def _check(node: DictConfig) -> None:
 
 def _demo(node: DictConfig, _: Path) -> None:
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"  # no robot but ours shall hear of this
-    from physai.plots.drive import draw_drive
     from physai.ros.driving.goal_client import GoalClient
     from physai.ros.driving.processes import NodeProcess
+    from physai.ros.driving.square_client import SquareClient
 
     config = validate(DemoConfig, node)
     path = config.path()
@@ -78,7 +80,8 @@ def _demo(node: DictConfig, _: Path) -> None:
     console.print(f"{path} drives a virtual {policy.metadata.robot} (randomization={config.robot})")
     with ExitStack() as stack:
         logs = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="physai-demo-")))
-        client = stack.enter_context(closing(GoalClient(policy)))
+        kind = SquareClient if policy.metadata.floats else GoalClient
+        client: Client = stack.enter_context(closing(kind(policy)))
         client.check_alone()
         env = policy.metadata.raw["config"]["env"]["name"]
         robot = NodeProcess(
@@ -87,6 +90,7 @@ def _demo(node: DictConfig, _: Path) -> None:
             env=env,
             overrides=robot_overrides(policy.metadata),
             randomization=config.robot,
+            physics=robot_engine(policy.metadata),
             seed=config.seed,
         )
         period = 1.0 / policy.metadata.control_rate
@@ -104,18 +108,17 @@ def _demo(node: DictConfig, _: Path) -> None:
         client.watch = (robot, inference)
         client.wait_until_ready()
         console.print("virtual_robot and inference_node work; sending goals")
-        goals = policy.metadata.region.sample(config.goals, torch.Generator().manual_seed(config.seed))
-        for number, goal in enumerate(goals, 1):
-            result = client.send(goal, config.hold)
-            console.print(f"  {number:>3}  {result.describe()}", highlight=False, soft_wrap=True)
+        kept = []
+        for number, (line, as_wanted) in enumerate(client.drive(config.goals, config.hold, config.seed), 1):
+            console.print(f"  {number:>3}  {line}", highlight=False, soft_wrap=True)
+            kept.append(as_wanted)
     output = config.picture()
     try:
-        draw_drive(client.record, policy, output)
+        client.draw(output)
     except (OSError, ValueError) as error:
         raise UserError(f"cannot write {output}: {error}") from error
-    kept = sum(result.kept for result in client.record.results)
-    console.print(f"{kept} of {len(goals)} goals reached, and held for {config.hold:g} s. The path: {output}")
-    if kept < len(goals):
+    console.print(f"{sum(kept)} of {len(kept)} {client.done(config.hold)}. The path: {output}")
+    if not all(kept):
         sys.exit(1)
 
 

@@ -305,7 +305,7 @@ def test_an_artifact_that_drives_worse_is_refused(trained):
     driven = gate.check_drive(save(script(policy)), policy, actor, env, 64, seed=5)
     assert driven.success_rate > 0.9
     policy.pipeline.command.scale.mul_(-1)
-    with pytest.raises(gate.GateError, match="does not drive as the policy does: it reaches"):
+    with pytest.raises(gate.GateError, match="does not drive as the policy does: of 64 episodes"):
         gate.check_drive(save(script(policy)), policy, actor, env, 64, seed=5)
 
 

@@ -6,7 +6,7 @@ import pytest
 
 from physai.deploy import Policy, load_policy
 
-for helper in ("files", "hearing", "robot", "targets", "world"):
+for helper in ("files", "hearing", "legs", "robot", "targets", "world"):
     pytest.register_assert_rewrite(f"tests.deploy.{helper}")
 
 
@@ -20,6 +20,12 @@ def policy(exported_run) -> Policy:
 def position_policy(position_run) -> Policy:
     """The same, of an arm that is driven by positions."""
     return load_policy(position_run / "policy.pt")
+
+
+@pytest.fixture(scope="session")
+def walking_policy(walking_run) -> Policy:
+    """The same, of a robot on legs."""
+    return load_policy(walking_run / "policy.pt")
 
 
 @pytest.fixture(scope="session")

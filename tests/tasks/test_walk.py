@@ -157,11 +157,3 @@ def test_an_arm_s_task_is_refused_for_a_robot_without_an_end_effector(env_config
     config = env_config("reacher", "robot@env.robot=a1", f"env.start.spread={[0] * 12}")
     with pytest.raises(UserError, match="robot 'a1' has no end effector"):
         Simulation(config, 1, seed=0)
-
-
-def test_a_policy_file_for_legs_is_refused_by_name(run):
-    code, _, error = run("train", "env=a1_walk", "physics=mujoco", "export.formats=[torchscript]", "collector=single")
-    assert code == 2
-    assert error == (
-        "error: the base of robot 'a1' floats: a policy file (export.formats) for such a robot is not possible yet\n"
-    )

@@ -1,24 +1,19 @@
 """Sending an arm from goal to goal over ROS 2, and seeing what it does."""
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+import torch
 from sensor_msgs.msg import JointState
-from std_msgs.msg import String
 
 from physai.deploy import Policy, State
-from physai.errors import UserError
-from physai.ros.driving.processes import NodeProcess
-from physai.ros.node.guest import Guest
-from physai.ros.topics import goals, joint_states, qos
-from physai.ros.topics.commands import controller_topic
+from physai.ros.driving.client import Client
+from physai.ros.topics import joint_states, qos
 from physai.signals import Tolerance
 
-_LOOK = 1.0  # s for others to be discovered
-_START = 30.0  # s until both nodes work
 _PER_GOAL = 60.0  # s
 _SETTLE = 0.1  # s that a goal may take to the node
 
@@ -80,48 +75,21 @@ class Record:
     positions: list[np.ndarray] = field(default_factory=list)
 
 
-class GoalClient:
-    """The node that sends goals and watches joint states and the inference node's state, in a context of its own.
+class GoalClient(Client):
+    """Sends an arm to goals, and watches its joint states.
 
     Args:
         policy: Tells how far the robot is from a goal.
 
     Attributes:
         record: What happened so far.
-        watch: Processes that must not end meanwhile.
     """
 
     def __init__(self, policy: Policy) -> None:
+        super().__init__(policy.metadata, "goal_client")
         self.record = Record()
-        self.watch: Sequence[NodeProcess] = ()
         self._policy = policy
-        self._metadata = policy.metadata
-        self._state = ""
-        self._stopped = ""
-        self._guest = Guest("goal_client")
-        self._node = self._guest.node
-        self._goals = self._node.create_publisher(goals.goal_type(policy.metadata.goal), "inference_node/goal", 1)
-        self._node.create_subscription(JointState, joint_states.TOPIC, self._take_joint_state, qos.SENSOR)
-        self._node.create_subscription(String, "inference_node/state", self._take_state, qos.LATCHED)
-        self._node.create_subscription(DiagnosticArray, "/diagnostics", self._take_diagnostics, 10)
-
-    def check_alone(self) -> None:
-        """See that there is no other robot whose controller would obey.
-
-        Raises:
-            UserError: If there is.
-        """
-        end = time.monotonic() + _LOOK
-        while time.monotonic() < end:
-            self._guest.executor.spin_once(0.05)
-            topics = controller_topic(self._metadata.command.quantity), joint_states.TOPIC
-            commands, states = map(self._node.resolve_topic_name, topics)
-            for name, others in (
-                (commands, self._node.count_subscribers(commands) + self._node.count_publishers(commands)),
-                (states, self._node.count_publishers(states)),
-            ):
-                if others:
-                    raise UserError(f"another node uses {name} here: choose another ROS_DOMAIN_ID")
+        self.node.create_subscription(JointState, joint_states.TOPIC, self._take_joint_state, qos.SENSOR)
 
     def wait_until_ready(self) -> None:
         """Wait for joint states, and for a node that waits for a goal.
@@ -129,11 +97,23 @@ class GoalClient:
         Raises:
             UserError: If they do not come.
         """
-        ready = (State.WAITING.value, State.REACHED.value)
-        if not self._spin(
-            lambda: self.record.times and self._state in ready and self._goals.get_subscription_count(), _START
-        ):
-            raise UserError(f"the nodes do not work: joint states: {bool(self.record.times)}, state: '{self._state}'")
+        self.wait_until("joint states", lambda: self.record.times, (State.WAITING.value, State.REACHED.value))
+
+    def drive(self, goals: int, hold: float, seed: int) -> Iterator[tuple[str, bool]]:
+        """See :class:`Client`; goals are drawn from those that the policy was trained on."""
+        for goal in self._metadata.region.sample(goals, torch.Generator().manual_seed(seed)):
+            result = self.send(goal, hold)
+            yield result.describe(), result.kept
+
+    def done(self, hold: float) -> str:
+        """See :class:`Client`."""
+        return f"goals reached, and held for {hold:g} s"
+
+    def draw(self, output: Path) -> None:
+        """See :class:`Client`."""
+        from physai.plots.drive import draw_drive
+
+        draw_drive(self.record, self._policy, output)
 
     def send(self, goal: np.ndarray, hold: float) -> GoalResult:
         """Send a goal [g], wait until it is reached, and watch the robot for a while, s.
@@ -141,15 +121,14 @@ class GoalClient:
         Raises:
             UserError: If the node stops the robot for good, or one of the processes has ended.
         """
-        signal = self._metadata.goal
-        result = GoalResult(goal, signal.unit, self._metadata.tolerances, time.monotonic())
+        result = GoalResult(goal, self._metadata.goal.unit, self._metadata.tolerances, time.monotonic())
         self.record.results.append(result)
-        self._goals.publish(goals.to_message(goal.tolist(), signal, self._node.get_clock().now().to_msg()))
-        self._spin(lambda: False, _SETTLE)
-        if self._spin(lambda: self._state == State.REACHED.value and result.within(self._error(-1, goal)), _PER_GOAL):
+        self.publish(goal.tolist())
+        self.spin(lambda: False, _SETTLE)
+        if self.spin(lambda: self.state == State.REACHED.value and result.within(self._error(-1, goal)), _PER_GOAL):
             result.reached = time.monotonic()
             seen = len(self.record.positions)
-            self._spin(lambda: False, hold)
+            self.spin(lambda: False, hold)
             held = range(seen, len(self.record.positions))
             result.error = np.max([self._error(index, goal) for index in held], axis=0) if held else None
         return result
@@ -157,30 +136,7 @@ class GoalClient:
     def _error(self, index: int, goal: np.ndarray) -> np.ndarray:
         return self._policy.error(self.record.positions[index], goal)
 
-    def _spin(self, done: Callable[[], object], seconds: float) -> bool:
-        end = time.monotonic() + seconds
-        while time.monotonic() < end:
-            self._guest.executor.spin_once(0.05)
-            if done():
-                return True
-            if self._stopped:
-                raise UserError(f"the inference node has stopped the robot: {self._stopped}")
-            for process in self.watch:
-                if process.ended:
-                    raise UserError(f"{process.module} has ended: {process.last_words()}")
-        return False
-
     def _take_joint_state(self, message: JointState) -> None:
         index = [message.name.index(joint) for joint in self._metadata.joints]
         self.record.times.append(time.monotonic())
         self.record.positions.append(np.array(message.position)[index])
-
-    def _take_state(self, message: String) -> None:
-        self._state = message.data
-
-    def _take_diagnostics(self, message: DiagnosticArray) -> None:
-        self._stopped = next((s.message for s in message.status if s.level == DiagnosticStatus.ERROR), "")
-
-    def close(self) -> None:
-        """Leave ROS."""
-        self._guest.close()

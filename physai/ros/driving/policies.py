@@ -20,6 +20,12 @@ def newest_policies() -> list[Path]:
     return found
 
 
+def robot_engine(metadata: Metadata) -> str:
+    """Which file of ``conf/physics`` simulates the robot: legs walk in the engine that they were trained in."""
+    engine = metadata.raw["config"]["env"]["physics"]["_target_"]
+    return "mujoco" if metadata.floats and engine.endswith("MuJoCoPhysics") else "pybullet"
+
+
 def robot_overrides(metadata: Metadata) -> list[str]:
     """What makes the virtual robot the one that the policy was trained on: Hydra overrides of its env.
 

@@ -1,0 +1,221 @@
+"""The controller of legs: it stands up, walks, stands without a command, and gives way in a fault."""
+
+import math
+import random
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from physai.deploy import Controller, ControllerConfig, Goal, Imu, JointState, State, make_controller
+from physai.errors import UserError
+from tests.deploy.legs import AHEAD, PERIOD, Legs
+
+LYING = tuple(Rotation.from_euler("x", 1.2).as_quat())
+
+
+@pytest.fixture
+def legs(walking_policy):
+    made = Legs(walking_policy)
+    yield made
+    made.physics.close()
+
+
+def gives_way(legs, state):
+    """Each joint is told to be where it is."""
+    for _ in range(5):
+        command = legs.tick()
+        assert command.state is state
+        np.testing.assert_array_equal(command.value, legs.controller._robot.position)
+
+
+def test_it_stands_up_where_it_is_and_then_walks_as_it_is_told(legs):
+    rising = legs.ticks(45, goal=AHEAD)
+    assert {command.state for command in rising} == {State.ACTIVE}
+    assert abs(legs.true.pose[0]) < 0.15
+    start = legs.true.pose[0]
+    commands = legs.ticks(250, goal=AHEAD)
+    assert all(command.state is State.ACTIVE for command in commands)
+    assert 1.5 < legs.true.pose[0] - start < 3.0
+    assert legs.true.pose[2] > 0.22
+
+
+def test_it_turns_to_the_left_as_it_is_told(legs):
+    legs.ticks(200, goal=(0.4, 0.0, 0.5))
+    yaw = Rotation.from_quat(legs.true.pose[3:]).as_euler("ZYX")[0]
+    assert 0.8 < yaw < 2.2
+
+
+def test_without_a_fresh_command_it_stands_and_goes_on_with_the_next(legs):
+    legs.walk()
+    commands = legs.ticks(100)
+    assert all(command.state is State.ACTIVE for command in commands)
+    assert commands[-1].reasons[0].startswith("the last command is 2.0 s old: it stands")
+    assert np.hypot(*legs.true.velocity[:2]) < 0.05
+    legs.walk()
+    assert legs.true.velocity[0] > 0.2
+
+
+def test_a_command_faster_than_it_has_learned_counts_as_the_fastest(legs):
+    legs.walk()
+    legs.tick(goal=(3.0, 0.0, -9.0))
+    assert legs.controller.snapshot()["goal"] == [0.8, 0.0, -0.5]
+    assert legs.counters["goals projected"] == 1
+
+
+@pytest.mark.parametrize("goal", [Goal([math.nan, 0, 0], "trunk"), Goal([0.5, 0], "trunk"), Goal([0.5, 0, 0], "map")])
+def test_a_command_that_is_none_is_refused_and_the_last_one_stays(legs, goal):
+    legs.walk()
+    command = legs.controller.update(legs.now + PERIOD, legs.state(stamp=legs.now + PERIOD), goal)
+    assert command.state is State.ACTIVE
+    assert command.reasons[0].startswith("goal rejected")
+    assert legs.controller.snapshot()["goal"] == list(AHEAD)
+
+
+@pytest.mark.parametrize("silent", ["state", "imu"])
+def test_in_a_hold_it_keeps_what_it_was_told_and_goes_on_when_it_is_heard_of_again(legs, silent):
+    told = legs.walk().value
+    commands = legs.ticks(9, goal=AHEAD, **{silent: None})
+    held = [command for command in commands if command.state is State.HOLD]
+    assert len(held) >= 3
+    assert all(np.array_equal(command.value, held[0].value) for command in held)
+    assert any(text in held[-1].reasons[0] for text in ("the last joint state is", "the last reading of the IMU is"))
+    assert np.abs(held[0].value - told).max() < 0.5
+    assert [command.state for command in legs.ticks(8, goal=AHEAD)][-3:] == [State.ACTIVE] * 3
+
+
+def test_to_lean_too_far_is_a_fault_in_which_the_joints_only_damp(legs):
+    legs.walk()
+    command = legs.tick(imu=legs.imu(orientation=LYING, stamp=legs.now + PERIOD))
+    assert command.state is State.FAULT
+    assert command.reasons == ("the base leans by 1.20 rad",)
+    gives_way(legs, State.FAULT)
+    height = legs.true.pose[2]
+    legs.ticks(100)
+    assert legs.true.pose[2] < height - 0.05  # it has sunk
+    assert np.abs(legs.true.speed).max() < 3.0
+
+
+def test_an_emergency_stop_lets_it_sink_and_after_a_reset_only_a_new_command_moves_it(legs):
+    legs.walk()
+    legs.controller.emergency_stop()
+    gives_way(legs, State.ESTOP)
+    legs.ticks(50)
+    assert legs.controller.reset()
+    commands = legs.ticks(20)
+    assert [command.state for command in commands[:4]] == [State.HOLD] * 4
+    assert commands[-1].state is State.WAITING
+    assert commands[-1].reasons == ("no goal yet",)
+    assert np.array_equal(commands[-1].value, commands[0].value)
+    legs.ticks(200, goal=AHEAD)
+    assert legs.true.velocity[0] > 0.2  # it stood up again
+
+
+def test_it_waits_for_the_first_reading_of_the_imu(legs):
+    command = legs.ticks(3, goal=AHEAD, imu=None)[-1]
+    assert command.state is State.WAITING
+    assert command.reasons == ("no reading of the IMU yet",)
+    assert legs.tick(goal=AHEAD).state is State.ACTIVE
+
+
+def test_a_policy_that_fails_three_times_is_a_fault(legs):
+    legs.walk()
+    legs.policy.trouble = "nan"
+    assert [command.state for command in legs.ticks(3, goal=AHEAD)][-1] is State.FAULT
+    gives_way(legs, State.FAULT)
+
+
+def test_who_asks_twice_as_often_gets_the_same_walk(walking_policy):
+    once, twice = Legs(walking_policy), Legs(walking_policy)
+    asked = []
+    for legs, count in ((once, 1), (twice, 2)):
+        for _ in range(50):
+            legs.physics.step(legs.told[None])
+            for _ in range(count):
+                legs.now += PERIOD / count
+                goal, state = Goal(AHEAD, "trunk"), legs.state()
+                legs.told = legs.controller.update(legs.now, state, goal, (), legs.imu()).value
+        asked.append(legs.true.pose)
+        legs.physics.close()
+    np.testing.assert_allclose(asked[0], asked[1], atol=0.02)
+
+
+def test_an_arm_s_controller_refuses_it_by_name(walking_policy):
+    with pytest.raises(UserError, match="the policy takes 'angular_velocity': this controller can tell joint_position"):
+        Controller(walking_policy)
+
+
+READINGS = {
+    "nan": lambda imu, rng: {"angular_velocity": (math.nan, 0.0, 0.0)},
+    "no rotation": lambda imu, rng: {"orientation": (0.0, 0.0, 0.0, rng.choice((0.0, 0.5, math.inf)))},
+    "frozen": lambda imu, rng: {"stamp": 1.0},
+    "behind": lambda imu, rng: {"stamp": imu.stamp - 1.0},
+    "delayed": lambda imu, rng: {"received": imu.stamp - rng.uniform(0.0, 0.3)},
+    "another frame": lambda imu, rng: {"frame": "imu_link"},
+    "spinning": lambda imu, rng: {"angular_velocity": (0.0, 99.0, 0.0)},
+    "leaning": lambda imu, rng: {"orientation": tuple(Rotation.from_euler("y", rng.uniform(-3, 3)).as_quat())},
+    "too short": lambda imu, rng: {"orientation": (0.0, 1.0)},
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(2))
+def test_whatever_its_sensors_say_the_contract_is_kept(walking_policy, seed):
+    """10,000 updates of a robot whose sensors fail, at random: what is sent, and when it may walk."""
+    rng, metadata = random.Random(seed), walking_policy.metadata
+    config = ControllerConfig(command_timeout=0.3, rise_time=0.2)
+    controller, seen = make_controller(walking_policy, config), set()
+    position, now, heard, felt, tilt, commanded = metadata.home.copy(), 100.0, -math.inf, -math.inf, 0.0, -math.inf
+    trouble, left = None, 0
+    low, high = metadata.command.bounds
+    before, stamp = None, -math.inf
+    for _ in range(10_000):
+        left -= 1
+        if left < 0:
+            fails = rng.random() < 0.3
+            trouble = rng.choice([*READINGS, "no state", "no imu"]) if fails else None
+            left = rng.choice((1, 2, 10)) if fails else 20
+        now += PERIOD
+        position = np.clip(position + np.array([rng.uniform(-0.02, 0.02) for _ in position]), low, high)
+        state = JointState(metadata.joints, position, np.zeros(len(position)), now)
+        orientation = Rotation.from_euler("xyz", [rng.uniform(-0.3, 0.3) for _ in range(3)]).as_quat()
+        imu = Imu(tuple(orientation), tuple(rng.uniform(-1, 1) for _ in range(3)), now, metadata.goal.frame)
+        if trouble in READINGS:
+            imu = Imu(**vars(imu) | READINGS[trouble](imu, rng))
+        if trouble in (None, "no state", "delayed", "leaning", "behind", "frozen"):
+            if imu.stamp > stamp:
+                x, y, _, _ = imu.orientation
+                felt, tilt = imu.received or now, math.acos(np.clip(1 - 2 * (x * x + y * y), -1, 1))
+            stamp = imu.stamp
+        heard = heard if trouble == "no state" else now
+        goal = Goal([rng.uniform(0, 1), 0.0, rng.uniform(-1, 1)], metadata.goal.frame) if rng.random() < 0.2 else None
+        commanded = commanded if goal is None else now
+        if rng.random() < 0.02:
+            controller.reset()
+        if rng.random() < 0.001:
+            controller.emergency_stop()
+        command = controller.update(
+            now, None if trouble == "no state" else state, goal, (), None if trouble == "no imu" else imu
+        )
+        seen.add(command.state)
+        assert command.value is not None
+        assert np.isfinite(command.value).all()
+        if command.state is State.ACTIVE:
+            assert now - heard <= config.state_timeout
+            assert now - felt <= config.state_timeout + 1e-9
+            assert tilt <= config.max_tilt
+            assert (command.value >= low - 1e-9).all()
+            assert (command.value <= high + 1e-9).all()
+            if now - commanded > config.command_timeout:
+                assert any("it stands" in reason for reason in command.reasons)
+        elif command.state in (State.FAULT, State.ESTOP):
+            np.testing.assert_array_equal(command.value, controller._robot.position)
+        elif before is not None and before.state is command.state:  # a HOLD or a wait keeps what was told
+            np.testing.assert_array_equal(command.value, before.value)
+        before = command
+    assert seen == {State.ACTIVE, State.HOLD, State.FAULT, State.ESTOP, State.WAITING}
+    counters = controller.snapshot()["counters"]
+    for kind in ("not finite", "not a rotation", "stamp", "wrong frame", "implausible", "malformed"):
+        assert counters[f"IMU readings rejected: {kind}"] >= 10, kind
+    assert counters["faults: orientation"] >= 10
+    assert counters["holds: IMU old"] >= 20
