@@ -57,6 +57,7 @@ def test_what_is_no_reading_at_all_is_refused(reader):
         reader.read(None, 1.0, 0.0)
 
 
+@pytest.mark.fault("numbers of the IMU that stay the same for `state_timeout` while joints move")
 def test_numbers_that_stay_the_same_while_joints_move_are_those_of_a_frozen_sensor(reader):
     def read(number, speed):
         reader.read(Imu(**vars(GOOD) | {"stamp": 10.0 + 0.02 * number}), 1.0 + 0.02 * number, speed)

@@ -46,6 +46,7 @@ def test_it_turns_to_the_left_as_it_is_told(legs):
     assert 0.8 < yaw < 2.2
 
 
+@pytest.mark.fault("no velocity command for `command_timeout` (0.5 s)")
 def test_without_a_fresh_command_it_stands_and_goes_on_with_the_next(legs):
     legs.walk()
     commands = legs.ticks(100)
@@ -56,6 +57,7 @@ def test_without_a_fresh_command_it_stands_and_goes_on_with_the_next(legs):
     assert legs.true.velocity[0] > 0.2
 
 
+@pytest.mark.fault("a command faster than the policy was trained for")
 def test_a_command_faster_than_it_has_learned_counts_as_the_fastest(legs):
     legs.walk()
     legs.tick(goal=(3.0, 0.0, -9.0))
@@ -72,6 +74,7 @@ def test_a_command_that_is_none_is_refused_and_the_last_one_stays(legs, goal):
     assert legs.controller.snapshot()["goal"] == list(AHEAD)
 
 
+@pytest.mark.fault("a reading older than `state_timeout` (0.1 s), or a joint state")
 @pytest.mark.parametrize("silent", ["state", "imu"])
 def test_in_a_hold_it_keeps_what_it_was_told_and_goes_on_when_it_is_heard_of_again(legs, silent):
     told = legs.walk().value
@@ -84,6 +87,7 @@ def test_in_a_hold_it_keeps_what_it_was_told_and_goes_on_when_it_is_heard_of_aga
     assert [command.state for command in legs.ticks(8, goal=AHEAD)][-3:] == [State.ACTIVE] * 3
 
 
+@pytest.mark.fault("the base leans by more than `max_tilt` (0.8 rad)")
 def test_to_lean_too_far_is_a_fault_in_which_the_joints_only_damp(legs):
     legs.walk()
     command = legs.tick(imu=legs.imu(orientation=LYING, stamp=legs.now + PERIOD))
@@ -96,6 +100,7 @@ def test_to_lean_too_far_is_a_fault_in_which_the_joints_only_damp(legs):
     assert np.abs(legs.true.speed).max() < 3.0
 
 
+@pytest.mark.fault("FAULT or ESTOP")
 def test_an_emergency_stop_lets_it_sink_and_after_a_reset_only_a_new_command_moves_it(legs):
     legs.walk()
     legs.controller.emergency_stop()
@@ -111,6 +116,7 @@ def test_an_emergency_stop_lets_it_sink_and_after_a_reset_only_a_new_command_mov
     assert legs.true.velocity[0] > 0.2  # it stood up again
 
 
+@pytest.mark.fault("no reading of the IMU yet")
 def test_it_waits_for_the_first_reading_of_the_imu(legs):
     command = legs.ticks(3, goal=AHEAD, imu=None)[-1]
     assert command.state is State.WAITING
@@ -158,6 +164,10 @@ READINGS = {
 }
 
 
+@pytest.mark.fault(
+    "a reading with a number that is not finite, with a quaternion that is no rotation, in another frame"
+)
+@pytest.mark.fault("a stamp of the IMU that is repeated or runs backwards, more than 40 rad/s")
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(2))
 def test_whatever_its_sensors_say_the_contract_is_kept(walking_policy, seed):

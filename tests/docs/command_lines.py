@@ -148,7 +148,7 @@ def _check_ros2(given: Sequence[str]) -> None:
         case ["run", "physai", node, "--ros-args", *rest]:
             assert (PACKAGE / "lib" / node).is_file()
             _check_node(node, rest)
-        case ["topic", "pub", "--once", topic, kind, fields]:
+        case ["topic", "pub", "--once", topic, kind, fields] | ["topic", "pub", "--rate", _, topic, kind, fields]:
             assert exists(topic), topic
             _fill(_message(kind)(), yaml.safe_load(fields))
         case ["service", "call", service, kind, fields]:

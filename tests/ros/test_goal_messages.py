@@ -2,7 +2,7 @@
 
 import pytest
 from builtin_interfaces.msg import Time
-from geometry_msgs.msg import PointStamped, PoseStamped
+from geometry_msgs.msg import PointStamped, PoseStamped, Twist
 from sensor_msgs.msg import JointState
 
 from physai.errors import UserError
@@ -13,6 +13,8 @@ PLACE = Signal("goal", Quantity.POSITION, (3,), labels=("x", "y", "z"), frame="b
 PLANE = Signal("goal", Quantity.POSITION, (2,), labels=("x", "y"), frame="base")
 POSE = Signal("goal", Quantity.POSE, (7,), labels=("x", "y", "z", "qx", "qy", "qz", "qw"), frame="base")
 JOINTS = Signal("goal", Quantity.JOINT_POSITION, (2,), labels=("a", "b"))
+
+TWIST = Signal("goal", Quantity.TWIST, (3,), labels=("vx", "vy", "yaw_rate"), frame="trunk")
 
 
 @pytest.mark.parametrize(
@@ -27,10 +29,18 @@ def test_a_goal_comes_out_of_its_message_as_it_went_in(signal):
     assert (goal.frame, goal.names) == (signal.frame, () if signal is not JOINTS else ("a", "b"))
 
 
+def test_a_velocity_comes_out_of_its_message_in_the_frame_of_the_base_and_has_a_topic_of_its_own():
+    message = goals.to_message([0.5, 0.1, -0.2], TWIST, Time(sec=7))
+    assert (message.linear.x, message.linear.y, message.angular.z) == (0.5, 0.1, -0.2)
+    assert goals.from_message(message, TWIST) == goals.Goal([0.5, 0.1, -0.2], "trunk")
+    assert (goals.topic(TWIST), goals.topic(POSE)) == ("~/cmd_vel", "~/goal")
+
+
 def test_the_type_of_a_message_follows_from_the_quantity():
     assert goals.goal_type(PLACE) is goals.goal_type(PLANE) is PointStamped
     assert goals.goal_type(POSE) is PoseStamped
     assert goals.goal_type(JOINTS) is JointState
+    assert goals.goal_type(TWIST) is Twist
     with pytest.raises(UserError, match="the policy's goal is a joint_velocity: no ROS message"):
         goals.goal_type(Signal("goal", Quantity.JOINT_VELOCITY, (2,)))
 
