@@ -138,6 +138,7 @@ def test_one_that_was_pressed_before_the_node_started_counts(policy_path, peer):
 
 
 @pytest.mark.slow
+@pytest.mark.realtime
 @pytest.mark.fault("latched `/emergency_stop` is still true")
 def test_a_reset_is_refused_while_one_of_two_latched_stops_is_still_pressed(loop):
     other = Peer(loop.peer.domain)
