@@ -19,5 +19,5 @@ class RaisingController(Controller):
 
 
 def main() -> int:
-    inference_node.Controller = RaisingController
+    inference_node.make_controller = RaisingController
     return inference_node.main()
