@@ -103,7 +103,7 @@ class ForgedProcess(Process):
             with contextlib.suppress(ProcessLookupError):  # it has just ended
                 os.kill(self._pid, number)
 
-    def wait(self, timeout: float = 20.0) -> int:
+    def wait(self, timeout: float = 60.0) -> int:
         wait_for(lambda: self.poll() is not None, timeout, f"an end of\n{self.output}")
         return self._forge.codes[self._pid]
 

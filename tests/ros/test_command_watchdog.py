@@ -68,19 +68,22 @@ def test_nonsense_becomes_zeros(watchdog, nonsense):
 
 @pytest.mark.slow
 def test_another_commander_of_the_controller_stops_the_arm(watchdog):
+    wait_for(lambda: watchdog.call("/command_watchdog/reset").success, what="a watchdog without a conflict")
     passes(watchdog, 0.1, 0.2)
     other = Peer(watchdog.domain)
-    other.publisher(Float64MultiArray, TOPIC, 1)
 
     def stopped() -> bool:
         send(watchdog, 0.1, 0.2)
         time.sleep(0.02)
         return len(watchdog.commands) > 5 and not any(any(velocity) for _, velocity in watchdog.commands[-5:])
 
-    wait_for(stopped, what="zeros while another one commands")
-    watchdog.process.says(f"zero velocity: another publisher commands {TOPIC}: peer")
-    assert not watchdog.call("/command_watchdog/reset").success
-    other.close()
+    try:
+        other.publisher(Float64MultiArray, TOPIC, 1)
+        wait_for(stopped, what="zeros while another one commands")
+        watchdog.process.says(f"zero velocity: another publisher commands {TOPIC}: peer")
+        assert not watchdog.call("/command_watchdog/reset").success
+    finally:
+        other.close()
     since = time.monotonic()
     while time.monotonic() < since + 0.5:  # it does not go on by itself
         send(watchdog, 0.1, 0.2)
@@ -93,12 +96,14 @@ def test_another_commander_of_the_controller_stops_the_arm(watchdog):
 @pytest.mark.realtime
 def test_who_commands_the_watchdog_may_stand_by_to_command_the_controller(watchdog):
     standby = watchdog.node.create_publisher(Float64MultiArray, TOPIC, 1)
-    passes(watchdog, 0.1, 0.2)
-    for _ in range(20):
-        send(watchdog, 0.1, 0.2)
-        time.sleep(0.02)
-    assert watchdog.commands[-1][1] == [0.1, 0.2]
-    watchdog.remove(standby)
+    try:
+        passes(watchdog, 0.1, 0.2)
+        for _ in range(20):
+            send(watchdog, 0.1, 0.2)
+            time.sleep(0.02)
+        assert watchdog.commands[-1][1] == [0.1, 0.2]
+    finally:
+        watchdog.remove(standby)
     assert watchdog.call("/command_watchdog/reset").success
 
 
@@ -111,11 +116,13 @@ def test_its_heart_beats_as_often_as_it_looks_and_not_while_it_stands_still(watc
     wait_for(lambda: len(beats) > 50)
     assert 0.8 < beats[50][0] - beats[0][0] < 1.3
     watchdog.process.signal(signal.SIGSTOP)
-    time.sleep(0.05)
-    count = len(beats)
-    time.sleep(0.2)
-    assert len(beats) == count
-    watchdog.process.signal(signal.SIGCONT)
+    try:
+        time.sleep(0.05)
+        count = len(beats)
+        time.sleep(0.2)
+        assert len(beats) == count
+    finally:
+        watchdog.process.signal(signal.SIGCONT)
     wait_for(lambda: len(beats) > count + 5)
 
 
@@ -125,11 +132,13 @@ def test_what_waited_while_the_watchdog_stood_still_is_not_passed_on(watchdog):
     for _ in range(3):
         passes(watchdog, 0.1, 0.2)
         watchdog.process.signal(signal.SIGSTOP)
-        time.sleep(0.3)
-        for _ in range(5):
-            send(watchdog, 0.1, 0.2)
-        since = time.monotonic()
-        watchdog.process.signal(signal.SIGCONT)
+        try:
+            time.sleep(0.3)
+            for _ in range(5):
+                send(watchdog, 0.1, 0.2)
+        finally:
+            since = time.monotonic()
+            watchdog.process.signal(signal.SIGCONT)
         wait_for(lambda: time.monotonic() > since + 0.3)  # noqa: B023
         after = [(at, any(velocity)) for at, velocity in watchdog.commands if at > since]
         moving = [at for at, moves in after if moves]

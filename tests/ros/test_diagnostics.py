@@ -99,7 +99,7 @@ def test_with_the_joint_state_as_trigger_commands_answer_states(policy_path):
         commands = [at for at, _ in loop.peer.commands if at > since]
         states = [at for at in loop.arm.sent if since < at < commands[-1]]
         # One for one, but for what is under way, and for states that came while the node still worked on one.
-        assert 0.75 * len(states) < len(commands) <= len(states) + 5
+        assert 0.75 * len(states) < len(commands) <= len(states) + 15
         answers = [next((at for at in commands if at > sent), math.inf) - sent for sent in states[:-1]]
         assert statistics.median(answers) < 0.02
         for _ in range(3):

@@ -125,6 +125,7 @@ def test_a_node_killed_in_an_emergency_stop_is_in_it_when_it_starts_again(policy
         since = time.monotonic()
         peer.emergency_stop()
         peer.wait_state("estop", after=since)
+        wait_for(lambda: list((tmp_path / "physai").glob("*.estop")), what="the file")  # a slow disk is not waited for
         loop.node.signal(signal.SIGKILL)
         loop.node.wait()
         loop.arm.leave()

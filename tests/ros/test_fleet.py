@@ -87,15 +87,14 @@ def set_off(robots: list[Robot]) -> None:
 @pytest.mark.fault("true on `/emergency_stop`, or on `<namespace>/emergency_stop`")
 def test_each_robot_is_driven_and_stopped_for_itself_and_one_topic_stops_all(start, peer, policy_path):
     """Some seconds: six processes, and the ways in which two robots could disturb each other."""
+    button = peer.publisher(Bool, "/emergency_stop", qos.LATCHED)  # early enough to be known when it is pressed
     left, right = robots = fleet_of(start, peer, policy_path, 2)
     peer.publish("/arm1/emergency_stop", Bool(data=True))
     wait_for(lambda: left.is_in("estop"))
-    time.sleep(0.2)
-    assert not any(any(velocity) for _, velocity in left.commands[-5:])
+    wait_for(lambda: not any(any(velocity) for _, velocity in left.commands[-5:]), 5.0, "an arm that stands")
     assert not right.is_in("estop")
     left.reset()
     set_off(robots)
-    button = peer.publisher(Bool, "/emergency_stop", qos.LATCHED)
     button.publish(Bool(data=True))
     for robot in robots:
         wait_for(lambda robot=robot: robot.is_in("estop"), what=f"a stop of {robot.namespace}")

@@ -10,9 +10,13 @@ from collections import defaultdict
 
 import pytest
 from foxglove.messages import FrameTransforms
+from geometry_msgs.msg import Point, PointStamped
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from std_msgs.msg import Header
 from websockets.sync.client import connect
+
+from tests.ros.peer import wait_for
 
 ROBOT = ("-r", "__ns:=/arm1")
 HEARD = {
@@ -86,8 +90,11 @@ def test_a_foreign_client_finds_every_channel_and_hears_what_the_recorder_writes
     recorder = start("record", output=tmp_path / "bag", robots="all")
     recorder.says("recording")
     watcher = Watcher(port_of(foxglove))
+    topic = "/arm1/inference_node/goal"
+    goals = peer.publisher(PointStamped, topic)
+    wait_for(lambda: watcher.watch(0.2) or goals.get_subscription_count() >= 3, 60.0, "node, recorder and stream")
     watcher.watch(2.0)
-    peer.publish("/arm1/inference_node/goal", goal(-0.3, 0.2))
+    goals.publish(goal(-0.3, 0.2))
     watcher.watch(3.0)
     watcher.close()
     recorder.signal(signal.SIGINT)
@@ -115,10 +122,7 @@ def test_a_foreign_client_finds_every_channel_and_hears_what_the_recorder_writes
     assert "/arm1/joint_states" in json.dumps(told)
 
 
-def goal(x: float, y: float):
-    from geometry_msgs.msg import Point, PointStamped
-    from std_msgs.msg import Header
-
+def goal(x: float, y: float) -> PointStamped:
     return PointStamped(header=Header(frame_id="base"), point=Point(x=x, y=y))
 
 

@@ -53,7 +53,7 @@ def test_a_failing_session_leaves_nothing(policy_path, tmp_path, kill):
         env=environment,
         capture_output=True,
         text=True,
-        timeout=120,
+        timeout=240,
         check=False,
     )
     assert "on purpose" in session.stdout, session.stdout + session.stderr

@@ -78,10 +78,21 @@ def test_a_node_that_stood_still_sends_zeros_first_and_no_burst(driven, peer):
 
 @pytest.mark.slow
 def test_after_a_killed_node_a_faithful_robot_moves_on_and_on(driven, peer):
-    _, node = driven()
+    _, node = driven(resume_timeout=10.0)
+
+    def stands_still_while_the_arm_moves():
+        node.signal(signal.SIGSTOP)
+        peer.silent()
+        if max(map(abs, peer.commands[-1][1])) > 0.05:
+            return True
+        since = time.monotonic()  # its last tick was a late one, and the arm stands
+        node.signal(signal.SIGCONT)
+        peer.moved(after=since)
+        return False
+
+    wait_for(stands_still_while_the_arm_moves)
     node.signal(signal.SIGKILL)
     node.wait()
-    peer.silent()
     since = time.monotonic()
     wait_for(lambda: time.monotonic() > since + 1.5)
     assert min(speed for _, speed in speeds(peer, since)) > 0.01

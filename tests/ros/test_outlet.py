@@ -34,6 +34,7 @@ with outlet.outlets():
         print("line", number, "x" * 100)
         longest = max(longest, time.monotonic() - began)
         time.sleep(0.0002)
+    time.sleep(0.1)  # until they are counted
     with open({report!r}, "w") as file:
         file.write(f"{{longest}} {{outlet.dropped_lines()}}")
     time.sleep({wait})

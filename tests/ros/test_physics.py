@@ -132,6 +132,7 @@ def test_a_robot_without_the_service_is_driven_home_and_stands_there(start_robot
     q, qd = arrays(physics.robot_state())
     assert np.abs(q).max() <= 0.02
     np.testing.assert_allclose(qd, 0.0, atol=0.01)
+    wait_for(lambda: zeros_last(peer))
     sent = np.array([command for at, command in peer.commands if at > since + 0.1])
     assert 0.9 < np.abs(sent).max() <= 1.0 + 1e-9
     assert not sent[-1].any()

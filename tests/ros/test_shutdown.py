@@ -40,7 +40,7 @@ def test_the_last_command_is_zero_five_times_of_five(policy_path, end, code):
     with contextlib.ExitStack() as stack:
         loops = [stack.enter_context(closed_loop(policy_path, rate=50.0, module=module, goal=GOAL)) for _ in range(5)]
         for loop in loops:
-            loop.peer.moved()
+            loop.peer.moved(after=time.monotonic())
             if raising:
                 loop.peer.send_goal(*FAR)
             else:
@@ -56,7 +56,7 @@ def test_the_last_command_is_zero(policy_path):
     with contextlib.ExitStack() as stack:
         loops = {name: stack.enter_context(closed_loop(policy_path, rate=50.0, goal=GOAL)) for name in ENDS}
         for name, loop in loops.items():
-            loop.peer.moved()
+            loop.peer.moved(after=time.monotonic())
             ENDS[name](loop)
         for name, loop in loops.items():
             assert loop.node.wait() == 0, (name, loop.node.output)
@@ -79,7 +79,7 @@ def test_a_node_that_never_had_a_say_ends_without_a_word(policy_path):
 @pytest.mark.fault("Ctrl-C, Ctrl-Z, or any number of signals")
 def test_a_storm_of_signals_ends_it_as_one_does(policy_path):
     with closed_loop(policy_path, goal=GOAL) as loop:
-        loop.peer.moved()
+        loop.peer.moved(after=time.monotonic())
         while loop.node.poll() is None:
             for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1, signal.SIGTSTP):
                 loop.node.signal(number)
