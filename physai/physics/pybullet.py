@@ -58,7 +58,7 @@ class PyBulletPhysics:
         spec: The robot.
         num_robots: How many, N.
         control_dt: Control period, s.
-        substeps: Physics steps per control period.
+        substeps: Physics steps per control period; joints that are springs get as many as their damping needs.
 
     Raises:
         UserError: If PyBullet refuses the URDF, or has no room for so many worlds.
@@ -91,7 +91,13 @@ class PyBulletPhysics:
         self._unit_inertia = masses
         self._row = [(world.client, body) for world in self._worlds for body in world.bodies]
         n = len(joints)
-        self._springs = Springs(self._row, joints) if spec.servo else None
+        self._springs = None
+        if spec.servo is not None:
+            self._springs = Springs(self._row, joints)
+            held = spec.floating is None
+            self.substeps = max(substeps, self._springs.substeps(control_dt, spec.home, spec.servo.damping, held))
+            for world in self._worlds:
+                bullet.setTimeStep(control_dt / self.substeps, world.client)
         self._base = FloatingBodies(spec.floating, self._row, loaded_links(spec), links) if spec.floating else None
         # Of all joints of all robots, in lists: what PyBullet takes and gives are single numbers.
         self._position, self._velocity, self._effort = ([0.0] * (num_robots * n) for _ in range(3))

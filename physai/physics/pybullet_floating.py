@@ -1,5 +1,6 @@
 """Robots whose base nothing holds, on a floor, in PyBullet; and joints that are springs."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -121,6 +122,26 @@ class Springs:
         self._clients = list(dict.fromkeys(client for client, _ in row))
         shape = len(row), len(joints)
         self._stiffness, self._damping, self._limit = (np.zeros(shape) for _ in range(3))
+
+    def substeps(self, control_dt: float, home: np.ndarray, damping: np.ndarray, held: bool) -> int:
+        """How many a control period must have, so that the damping of light legs does not make them tremble.
+
+        A damper that is asked once a substep of ``dt`` s must not take more than the velocity away that there is:
+        beyond ``damping * dt = 2 * inertia`` it is an engine. Half of that leaves room for other masses.
+
+        Args:
+            control_dt: s.
+            home: Where the joints are, rad, [n].
+            damping: N·m·s/rad, [n].
+            held: Whether the base is fixed.
+        """
+        client, body = self._row[0]
+        order = np.argsort(self._joints)
+        at_home = [*([] if held else [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]), *home[order].tolist()]
+        mass = np.array(bullet.calculateMassMatrix(body, at_home, physicsClientId=client))
+        inertia = mass[-len(order) :, -len(order) :]
+        lightest = np.linalg.eigvalsh(inertia / np.sqrt(np.outer(damping[order], damping[order]) + 1e-12)).min()
+        return math.ceil(control_dt / lightest)
 
     def set(self, rows: np.ndarray, parameters: DynamicsParameters) -> None:
         """Give them new dynamics; PyBullet's own motors hold joints as friction would."""

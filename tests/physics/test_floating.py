@@ -15,7 +15,7 @@ from tests.physics.conftest import MOTOR
 
 ENGINES = {"pybullet": PyBulletPhysics, "mujoco": partial(MuJoCoPhysics, motor="impulse", **MOTOR)}
 DT = 0.02
-CONTROL = {"pybullet": 10, "mujoco": 4}  # substeps
+SUBSTEPS = 4
 
 
 @pytest.fixture(scope="module")
@@ -28,7 +28,7 @@ def make(request):
     made = []
 
     def make_physics(spec, robots):
-        made.append(ENGINES[request.param](spec, robots, DT, CONTROL[request.param]))
+        made.append(ENGINES[request.param](spec, robots, DT, SUBSTEPS))
         return made[-1]
 
     yield make_physics
@@ -60,6 +60,19 @@ def test_a_dropped_robot_stands_on_its_feet_and_on_nothing_else(legged, make):
     assert np.abs(state.base_twist).max() < 0.1
     weight = 9.81 * legged.link_mass.sum()
     assert 0.3 * weight * 0.05 < np.abs(state.joint_effort).sum(axis=1).min() < legged.effort_limit.sum()
+
+
+def test_legs_that_are_light_and_damped_come_to_rest_in_the_air(legged, make):
+    physics, robots = make(legged, 2), np.arange(2)
+    parameters = {key: value.repeat(2, axis=0) for key, value in nominal_dynamics(legged).items()}
+    parameters["link_mass"] *= 0.8
+    parameters["servo_damping"] *= 1.2
+    state = lifted(legged, 2, by=50.0)
+    state.joint_position[:] += 0.1
+    physics.reset(robots, state, parameters)
+    speeds = [np.abs(stand(physics, legged, DT).joint_velocity).max() for _ in range(25)]
+    assert max(speeds) < 20.0
+    assert speeds[-1] < 0.05
 
 
 def test_engines_agree_on_how_a_base_falls_and_turns(legged, make):
