@@ -51,8 +51,7 @@ class Metadata:
         raw: The JSON object.
         robot: Name of the robot.
         joints: Names of the n joints, in the policy's order; the arrays below follow it.
-        floats: Whether nothing holds its base, which its joints carry as springs; a position command is then how far
-            from home each is to be, whatever it was before.
+        floats: Whether nothing holds its base; its joints are springs then, and are told where about home to be.
         home: Rest pose, rad, [n].
         position_limit: rad, [n, 2]; infinite for continuous joints.
         velocity_limit: rad/s, [n].
@@ -137,7 +136,7 @@ class Metadata:
             raise PolicyError("metadata: limits.position must be pairs of lower and upper limit")
         inputs = tuple(_signal(raw, key) for key in _items(raw, "inputs", 32, "signals"))
         outputs = tuple(_signal(raw, key) for key in _items(raw, "outputs", 32, "signals"))
-        floats = _get(raw, "robot.base", str) == "floating" if "base" in raw["robot"] else False
+        floats = raw["robot"].get("base") == "floating"
         _check_signals(inputs, outputs, tuple(joints), floats)
         goal = next(signal for signal in inputs if signal.name == GOAL)
         region, tolerances = _asked(raw, goal)
@@ -147,8 +146,7 @@ class Metadata:
         if not 0 < pairs <= MAX_PAIRS:
             raise PolicyError(f"metadata: there are {pairs:,} golden pairs, not 1 to {MAX_PAIRS:,}")
         shapes = {signal.name: (pairs, *signal.shape) for signal in (*inputs, *outputs)}
-        if ERROR in raw["golden"] or not floats:
-            shapes[ERROR] = (pairs, len(tolerances))
+        shapes |= {ERROR: (pairs, len(tolerances))} if ERROR in raw["golden"] or not floats else {}
         found = cls(
             raw=raw,
             robot=_get(raw, "robot.name", str),
@@ -278,14 +276,13 @@ def _check_signals(
     inputs: tuple[Signal, ...], outputs: tuple[Signal, ...], joints: tuple[str, ...], floats: bool
 ) -> None:
     """See that a robot's policy takes and gives what a robot's policy must."""
-    names = [signal.name for signal in (*inputs, *outputs)]
-    if len(set(names)) != len(names) or ERROR in names:
+    if len(names := {signal.name for signal in (*inputs, *outputs)}) < len((*inputs, *outputs)) or ERROR in names:
         raise PolicyError("metadata: the names of inputs and outputs must be distinct")
     command, *memory = outputs
     if command.quantity not in _COMMANDS or command.name != f"{command.quantity.value}_command":
         raise PolicyError("metadata: the first of outputs must be a command of joint velocities or positions")
-    wanted: dict[str, Quantity | None] = {POSITION: Quantity.JOINT_POSITION, GOAL: None}
-    wanted[VELOCITY] = Quantity.JOINT_VELOCITY
+    sensed = {POSITION: Quantity.JOINT_POSITION, VELOCITY: Quantity.JOINT_VELOCITY}
+    wanted: dict[str, Quantity | None] = {**sensed, GOAL: None}
     if floats and command.quantity is not Quantity.JOINT_POSITION:
         raise PolicyError("metadata: robot.base: one that floats needs a command of joint positions")
     if command.quantity is Quantity.JOINT_POSITION and not floats:
