@@ -71,7 +71,7 @@ def policies(panda, tmp_path_factory):
 
 def drive(policy, panda, config, ticks, seed=0, goals=None):
     """Drive from goal to goal among all configurations; return where the arm was, [T, n], and the controller."""
-    controller = Controller(policy, ControllerConfig(**FAST, **config))
+    controller = Controller(policy, ControllerConfig(**FAST, **config), lambda: 0.0)
     physics = MuJoCoPhysics(panda, 1, DT, motor="impulse", motor_time_constant=0.015, armature=0.0, threads=1)
     random, visited, state = np.random.default_rng(seed), [], physics.robot_state()
     for tick in range(ticks):
@@ -198,7 +198,7 @@ def test_a_point_in_the_base_the_floor_or_a_box_is_named(panda):
 
 
 def test_positions_that_are_not_finite_reach_no_guard(policies, panda):
-    controller = Controller(policies[0], ControllerConfig(**FAST))
+    controller = Controller(policies[0], ControllerConfig(**FAST), lambda: 0.0)
     command = controller.update(0.0, JointState(panda.joints, np.full(7, np.nan), np.zeros(7), stamp=0.0))
     assert command.value is None
     assert RobotState(panda.home[None], np.zeros((1, 7))).joint_position.shape == (1, 7)

@@ -173,7 +173,10 @@ class Peer:
             self._executor.spin()
         except ExternalShutdownException:
             pass
-        except RuntimeError:  # RCLError: the context ended while it began to wait
+        except (
+            RuntimeError,
+            AttributeError,
+        ):  # RCLError: the context ended while it began to wait; or what it waits for
             if self._context.ok():
                 raise
 

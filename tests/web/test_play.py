@@ -33,11 +33,11 @@ def colored(image, red, green, blue):
 
 
 class Camera:
-    """Where points of the plane z = 0 are in a picture, and back."""
+    """Where points of the plane z = 0 are in a picture, and back; from where it is, and where it looks, m."""
 
-    def __init__(self, image):
+    def __init__(self, image, place=None):
         self.height, self.width = image.shape[:2]
-        self.position, target = map(np.array, camera(REACH))
+        self.position, target = map(np.array, place or camera(REACH))
         ahead = (target - self.position) / np.linalg.norm(target - self.position)
         right = np.cross(ahead, [0, 0, 1])
         right /= np.linalg.norm(right)
