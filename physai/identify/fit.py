@@ -26,6 +26,7 @@ _PART = 0.25  # of a step of the recording: how finely a delay is found
 _EVERY = 4  # of the motions, one is held out
 SHARE = 0.1  # of the largest in a direction, from which a parameter has a part in it
 _TOLD = 0.3  # units; a parameter of which less is known cannot be told
+_SLOPES = 0.04  # relative error that slopes from differences may have
 _EXPLAINED = 1.5  # times the noise, up to which the errors of motions held out count as explained
 SPREAD = 1.96  # standard deviations of a 95 % interval
 
@@ -309,8 +310,12 @@ class _Problem:
         slopes = self.slopes(result.x, delay)[: -len(result.x)] / max(ratio, 1.0)
         shows = np.square(slopes[:, :size]).sum(axis=0)
         covariance = np.linalg.inv(slopes.T @ slopes + np.eye(len(result.x)))[:size, :size]
+        information = np.linalg.inv(covariance)
+        alone = 1.0 / np.sqrt(np.diag(information))
+        # What is left where slopes nearly cancel may be their own error; of a prior of one unit, all is certain.
+        values, directions = np.linalg.eigh(information - np.diag(np.square(_SLOPES / alone)))
+        covariance = (directions / np.maximum(values, 1.0)) @ directions.T
         deviation = np.sqrt(np.diag(covariance))
-        alone = 1.0 / np.sqrt(np.diag(np.linalg.inv(covariance)))
         unseen = shows < 1.0 / _TOLD**2
         # Along these directions a change of some units is lost in the noise.
         values, directions = np.linalg.eigh(covariance[~unseen][:, ~unseen])
