@@ -166,6 +166,9 @@ class Controller:
         self._counters["emergency stops"] += 1
         self._latched, self._latch_reason = State.ESTOP, "emergency stop"
 
+    def not_sent(self) -> None:
+        """Take note that the last command did not reach the robot, which others may move meanwhile."""
+
     def reset(self) -> bool:
         """Leave a fault, an emergency stop or a goal given up for a hold, which ends when the robot is seen to be well.
 
@@ -276,15 +279,13 @@ class Controller:
 
     def _check_following(self) -> None:
         """See whether the arm does what it is told, and tells what it does."""
-        deviation = self._following.heard(self._received, self._robot.motion)
-        if deviation is not None:
+        if (deviation := self._following.heard(self._received, self._robot.motion)) is not None:
             if not deviation.consistent:
                 raise JointStateError("velocity inconsistent", deviation.text, implausible=True)
             self._fault("following", deviation.text)
 
     def _check_position(self) -> None:
-        far = self._limits.far_beyond(self._robot.position)
-        if far is not None:
+        if (far := self._limits.far_beyond(self._robot.position)) is not None:
             joint, position = self.policy.metadata.joints[far], self._robot.position[far]
             self._fault("position", f"'{joint}' is far beyond its position limit, at {position:.3f} rad")
 
@@ -309,11 +310,9 @@ class Controller:
             missing = self._robot.oldest()
             reasons += ["no joint state yet" if missing is None else f"no state of '{missing}' yet", *interlocks]
             return State.WAITING
-        if self._needed:
-            reasons += [f"{self._needed} more good joint states are needed", *interlocks]
-            return State.HOLD
-        if self._gave_up:
-            reasons += [self._gave_up, *interlocks]
+        waits = f"{self._needed} more good joint states are needed" if self._needed else self._gave_up
+        if waits:
+            reasons += [waits, *interlocks]
             return State.HOLD
         reasons += interlocks
         if self._goal is None:

@@ -62,7 +62,7 @@ class ImuReader:
         self._frame, self.timeout = frame, timeout
         self.gravity, self.angular_velocity = np.full((2, 3), np.nan)
         self.received = self._stamp = -math.inf
-        self._changed = -math.inf
+        self._changed: dict[str, float] = {}
 
     @property
     def tilt(self) -> float:
@@ -88,6 +88,8 @@ class ImuReader:
             raise ImuError("not finite", "a number is not finite")
         if not abs((length := float(np.linalg.norm(orientation))) - 1.0) < _LENGTH:
             raise ImuError("not a rotation", f"its quaternion has the length {length:.3f}, not 1")
+        if not isinstance(imu.frame, str):
+            raise ImuError("malformed", "its frame is no name")
         if imu.frame != self._frame:
             raise ImuError("wrong frame", f"frame '{imu.frame}' is not '{self._frame}'")
         try:
@@ -104,11 +106,14 @@ class ImuReader:
         if (fastest := float(np.abs(turns).max())) > _FASTEST:
             raise ImuError("implausible", f"an angular velocity of {fastest:.0f} rad/s cannot be true", True)
         gravity = _down(orientation / length)
-        same = np.array_equal(gravity, self.gravity) and np.array_equal(turns, self.angular_velocity)
-        if speed < _MOVES or not same:
-            self._changed = received
-        elif (frozen := received - self._changed) > self.timeout:
-            raise ImuError("frozen", f"it has told the same for {frozen:.2f} s, and joints move", implausible=True)
+        for what, (value, last) in {
+            "orientation": (gravity, self.gravity),
+            "angular velocity": (turns, self.angular_velocity),
+        }.items():
+            if speed < _MOVES or not np.array_equal(value, last):
+                self._changed[what] = received
+            elif (frozen := received - self._changed[what]) > self.timeout:
+                raise ImuError("frozen", f"its {what} is the same for {frozen:.2f} s, and joints move", True)
         self.gravity, self.angular_velocity, self.received = gravity, turns, received
 
 

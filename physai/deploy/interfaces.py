@@ -183,13 +183,17 @@ class StanceInterface(VelocityInterface):
             self.target = position.copy()
         return self.target
 
+    def release(self) -> None:
+        """Forget what was sent: others may have moved the robot since."""
+        self.target, self.drives = None, False
+
     def give_way(self, position: np.ndarray) -> np.ndarray | None:
         """Leave springs without force, so that damping is all that is left; return what to send, [n].
 
         Args:
             position: Where the joints are, rad, [n]; NaN where that is not known.
         """
-        self.target, self.drives = None, False
+        self.release()
         return position.copy() if np.isfinite(position).all() else None
 
     def standstill(self, position: np.ndarray) -> np.ndarray:

@@ -13,9 +13,10 @@ from physai.deploy.controller import STEP, Controller
 from physai.deploy.goals import Goal, GoalError, accept
 from physai.deploy.imu import Imu, ImuError, ImuReader
 from physai.deploy.joints import JointState
-from physai.deploy.metadata import GOAL, MEMORY, POSITION, VELOCITY
+from physai.deploy.metadata import GOAL, MEMORY, POSITION, VELOCITY, Metadata
 from physai.deploy.parameters import ControllerConfig
 from physai.deploy.policy import Driver
+from physai.errors import UserError
 
 _ROUNDING = 1e-5  # rad; of positions of single precision
 
@@ -52,9 +53,8 @@ class LeggedController(Controller):
         self._imu = ImuReader(metadata.goal.frame, (config or ControllerConfig()).state_timeout)
         self._reading: Imu | None = None
         self._commanded = -math.inf  # when a good goal came
-        clocks = [signal.bounds[1].item() for signal in metadata.inputs if signal.name == "clock"]
-        self._turn = clocks[0] if clocks else math.inf  # s, after which the policy's clock begins again
-        self._walked = self._risen = 0.0
+        self._turn = _checked_turn(metadata)
+        self._walked = self._risen = self._rise = 0.0
         self._start = metadata.home
         self._nothing = np.zeros(len(metadata.joints))
         self._last_action = self._nothing
@@ -90,6 +90,10 @@ class LeggedController(Controller):
         self._commanded = -math.inf
         return super().forget_goal()
 
+    def not_sent(self) -> None:
+        """See :class:`Controller`: it then stands where it is, and not where it was told to be."""
+        self._interface.release()
+
     def snapshot(self) -> dict[str, Any]:
         """See :class:`Controller`; with the age of the IMU's last reading, s, and how far the base leans, rad."""
         heard = self._imu.received > -math.inf
@@ -106,6 +110,11 @@ class LeggedController(Controller):
         self._counters["goals projected"] += slower
         self._commanded = self._now or 0.0
 
+    def _hold(self, kind: str, reason: str) -> str:
+        if kind in ("silent", "another source"):
+            self._interface.release()
+        return super()._hold(kind, reason)
+
     def _sense(self, now: float, reasons: list[str]) -> None:
         reading, self._reading, imu = self._reading, None, self._imu
         if reading is not None and math.isfinite(now):
@@ -118,7 +127,7 @@ class LeggedController(Controller):
                     self._hold(f"IMU {rejected.kind}", str(rejected))
         if imu.received == -math.inf or not math.isfinite(now):
             return
-        if now - imu.received > self.config.state_timeout:
+        if not 0.0 <= now - imu.received <= self.config.state_timeout:  # nor of a time that has been set back
             reasons.append(self._hold("IMU old", f"the last reading of the IMU is {now - imu.received:.3f} s old"))
         if imu.tilt > self.config.max_tilt:
             self._fault("orientation", f"the base leans by {imu.tilt:.2f} rad")
@@ -167,16 +176,19 @@ class LeggedController(Controller):
     def _begin(self, position: np.ndarray) -> None:
         self._start, self._last_action = position, self._nothing
         self._walked = self._risen = self._step = 0.0
+        self._rise = self.config.rise_time
 
     def _wanted(self, reasons: list[str]) -> np.ndarray:
         """The velocity to walk with: zeros for a stand, while it rises and without a fresh command."""
         assert self._goal is not None
         assert self._now is not None
         age = self._now - self._commanded
-        if age > self.config.command_timeout:
+        if not 0.0 <= age <= self.config.command_timeout:
             self._tell(reasons, "steps without a fresh command", f"the last command is {age:.1f} s old: it stands")
-        elif self._risen >= self.config.rise_time:
+        elif self._risen >= self._rise:
             return self._goal
+        else:
+            reasons.append("it stands up")
         return np.zeros_like(self._goal)
 
     def _limited(self, answer: np.ndarray, before: np.ndarray, reasons: list[str]) -> np.ndarray:
@@ -187,8 +199,8 @@ class LeggedController(Controller):
             self._tell(reasons, "commands clamped", "the policy's command was beyond its range")
         target = np.clip(answer, low, high)
         self._last_action = np.clip((target - metadata.home) / metadata.command_limit, -1.0, 1.0)
-        if self._risen < self.config.rise_time:
-            target = self._start + self._risen / self.config.rise_time * (target - self._start)
+        if self._risen < self._rise:
+            target = self._start + self._risen / self._rise * (target - self._start)
         most = metadata.velocity_limit * self._period
         return np.clip(target, before - most, before + most)
 
@@ -196,6 +208,20 @@ class LeggedController(Controller):
         if velocity is None and self._latched is not None:
             return self._interface.give_way(self._robot.position)
         return super()._send(velocity, elapsed, reasons)
+
+
+def _checked_turn(metadata: Metadata) -> float:
+    """Return after how many s the policy's clock begins again; raises a UserError for signals of another shape."""
+    sizes = {"angular_velocity": 3, "gravity": 3, "last_action": len(metadata.joints), "clock": 1}
+    turn = math.inf
+    for signal in metadata.inputs:
+        if signal.name in sizes and signal.shape != (sizes[signal.name],):
+            raise UserError(f"the policy takes '{signal.name}' of the shape {list(signal.shape)}")
+        if signal.name == "clock":
+            turn = float(signal.bounds[1][0])
+    if not turn > 0:
+        raise UserError(f"the policy's clock begins again after {turn:g} s")
+    return turn
 
 
 def make_controller(

@@ -26,7 +26,7 @@ _PART = 0.25  # of a step of the recording: how finely a delay is found
 _EVERY = 4  # of the motions, one is held out
 SHARE = 0.1  # of the largest in a direction, from which a parameter has a part in it
 _TOLD = 0.3  # units; a parameter of which less is known cannot be told
-_SLOPES = 0.04  # relative error that slopes from differences may have
+_SLOPES = 0.025  # relative error that slopes from differences may have
 _EXPLAINED = 1.5  # times the noise, up to which the errors of motions held out count as explained
 SPREAD = 1.96  # standard deviations of a 95 % interval
 

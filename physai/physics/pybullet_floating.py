@@ -140,7 +140,8 @@ class Springs:
         at_home = [*([] if held else [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]), *home[order].tolist()]
         mass = np.array(bullet.calculateMassMatrix(body, at_home, physicsClientId=client))
         inertia = mass[-len(order) :, -len(order) :]
-        lightest = np.linalg.eigvalsh(inertia / np.sqrt(np.outer(damping[order], damping[order]) + 1e-12)).min()
+        root = np.sqrt(np.maximum(damping[order], 1e-6))
+        lightest = np.linalg.eigvalsh(inertia / np.outer(root, root)).min()
         return math.ceil(control_dt / lightest)
 
     def set(self, rows: np.ndarray, parameters: DynamicsParameters) -> None:

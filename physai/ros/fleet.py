@@ -47,12 +47,17 @@ class FleetConfig(Config):
         """
         if self.policies:
             found = [(Path(path), read_metadata(path)) for path in self.policies]
+            for path, metadata in found:
+                if metadata.floats:
+                    raise UserError(f"{path}: a fleet is of arms, and '{metadata.robot}' is on legs")
         else:
             newest: dict[str, tuple[Path, Metadata]] = {}
             for path in newest_policies():
                 metadata = read_metadata(path)
                 newest.setdefault(metadata.robot, (path, metadata))
-            found = list(newest.values())
+            found = [each for each in newest.values() if not each[1].floats]
+            if not found:
+                raise UserError("no policy.pt of an arm in outputs/: train one (python -m physai.train), or name one")
         return {f"/arm{number}": each for number, each in enumerate(islice(cycle(found), self.arms), 1)}
 
 

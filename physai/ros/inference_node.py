@@ -212,15 +212,16 @@ class InferenceNode(StoppableNode[InferenceConfig]):
         goal, self._goal = self._goal, None
         felt = {} if self._imu is None else {"imu": self._imu.take()}
         command = self._controller.update(now, self._robot.take(), goal, interlocks, **felt)
-        self._publish(command)
+        if not self._publish(command) or self._arrived < now:
+            self._controller.not_sent()
         self._forget_old_goal(now)
         before, self._command = self._command, command
         if goal is not None and self._imu is None:  # velocities come many times a second
             self.get_logger().info(f"goal {goals.describe(goal, self._controller.policy.metadata.goal)}")
         for reason in command.reasons:
-            if reason.startswith("goal"):
+            if reason.startswith("goal") and self._imu is None:
                 self.get_logger().warning(reason)
-            elif reason.startswith(("joint state rejected", "IMU rejected")):
+            elif reason.startswith(("goal", "joint state rejected", "IMU rejected")):
                 self.get_logger().warning(reason, throttle_duration_sec=1.0)
         if command.state is not before.state or interlocks != self._blocked:
             self._blocked = interlocks
@@ -237,6 +238,8 @@ class InferenceNode(StoppableNode[InferenceConfig]):
                 self._goal = None
         self._contested = rival is not None
         if (rivals := self._robot.rivals(now)) is not None:
+            found.append(rivals)
+        if self._imu is not None and (rivals := self._imu.rivals(now)) is not None:
             found.append(rivals)
         if (silence := self._commands.silence(now)) is not None:
             found.append(silence)
@@ -261,16 +264,17 @@ class InferenceNode(StoppableNode[InferenceConfig]):
         if forgotten:
             self.get_logger().warning(f"goal forgotten: commands have not reached the robot for {longest:g} s")
 
-    def _publish(self, command: Command) -> None:
+    def _publish(self, command: Command) -> bool:
         # A disabled node does not disturb another one, once it stands still, and unless there is an emergency.
         stands = self._contested and not self._enabled and self._command.state is not State.ACTIVE
         silent = stands and command.state is not State.ESTOP
         if command.value is None or silent or not self._publishing:
-            return
+            return False
         if self._takes_positions:
             moves = command.state is State.ACTIVE
             self._commands.still = self._in_order(self._controller.standstill if moves else command.value)
         self._commands.send(self._in_order(command.value))
+        return True
 
     def _in_order(self, values: np.ndarray) -> list[float]:
         """Values of the policy's joints, in the controller's order; other joints stand still."""
@@ -357,6 +361,8 @@ def _load(config: InferenceConfig) -> Driver:
 def _first_goal(config: InferenceConfig, policy: Driver) -> Goal | None:
     if not config.goal:
         return None
+    if policy.metadata.floats:
+        raise UserError("goal: a velocity is out of date before the robot stands: send them on ~/cmd_vel")
     goal = Goal(list(config.goal), policy.metadata.goal.frame)
     try:
         accept(goal, policy.metadata, config.unreachable_goal == "project")

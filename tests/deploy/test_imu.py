@@ -33,6 +33,7 @@ def test_it_tells_where_down_is_and_how_far_the_base_leans(reader):
         ("malformed", {"orientation": ("0", "0", "0", "1")}, False),
         ("malformed", {"angular_velocity": None}, False),
         ("malformed", {"stamp": "10"}, False),
+        ("malformed", {"frame": np.array(["trunk", "trunk"])}, False),
         ("malformed", {"stamp": math.nan}, False),
         ("not finite", {"angular_velocity": (0.0, math.inf, 0.0)}, False),
         ("not finite", {"orientation": (math.nan, 0.0, 0.0, 1.0)}, False),
@@ -66,6 +67,17 @@ def test_numbers_that_stay_the_same_while_joints_move_are_those_of_a_frozen_sens
         read(number, speed=0.1)  # of a robot that stands they may
     for number in range(50, 54):
         read(number, speed=2.0)
-    with pytest.raises(ImuError, match=r"it has told the same for 0\.1\d s, and joints move") as raised:
+    with pytest.raises(ImuError, match=r"its orientation is the same for 0\.1\d s, and joints move") as raised:
         read(55, speed=2.0)
     assert raised.value.implausible
+
+
+def test_an_orientation_that_stays_the_same_beside_rates_that_change_is_frozen(reader):
+    def read(number):
+        turns = (0.1 * number, 0.0, 0.0)
+        reader.read(Imu(GOOD.orientation, turns, 10.0 + 0.02 * number, "trunk"), 1.0 + 0.02 * number, 2.0)
+
+    for number in range(5):
+        read(number)
+    with pytest.raises(ImuError, match="its orientation is the same"):
+        read(7)

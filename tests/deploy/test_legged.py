@@ -116,6 +116,35 @@ def test_an_emergency_stop_lets_it_sink_and_after_a_reset_only_a_new_command_mov
     assert legs.true.velocity[0] > 0.2  # it stood up again
 
 
+@pytest.mark.fault("a stance that was not sent, or a robot that was silent")
+def test_a_stance_that_was_not_sent_is_forgotten_for_others_may_have_moved_the_robot(legs):
+    before = legs.ticks(3)[-1].value
+    for _ in range(2):
+        legs.physics.step(before[None] - 0.3)
+    np.testing.assert_array_equal(legs.tick().value, before)
+    legs.controller.not_sent()
+    legs.now += PERIOD
+    command = legs.controller.update(legs.now, legs.state(), None, (), legs.imu())
+    np.testing.assert_array_equal(command.value, legs.true.position)
+
+
+def test_another_rise_time_does_not_pull_it_back_in_the_midst_of_its_walk(legs):
+    told = legs.walk().value
+    legs.controller.configure(ControllerConfig(rise_time=60.0))
+    command = legs.tick(goal=AHEAD)
+    assert command.reasons == ()
+    assert np.abs(command.value - told).max() < 0.4
+
+
+def test_what_came_before_the_clock_was_set_back_is_not_fresh(legs):
+    legs.walk()
+    legs.now -= 10.0
+    assert {command.state for command in legs.ticks(20, imu=None)} == {State.HOLD}
+    command = legs.ticks(8)[-1]
+    assert command.state is State.ACTIVE
+    assert command.reasons[0].startswith("the last command is -9.")
+
+
 @pytest.mark.fault("no reading of the IMU yet")
 def test_it_waits_for_the_first_reading_of_the_imu(legs):
     command = legs.ticks(3, goal=AHEAD, imu=None)[-1]

@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 from physai.compose import conf_dir
 from physai.deploy import Metadata
@@ -36,9 +37,19 @@ def robot_overrides(metadata: Metadata) -> list[str]:
     files = [path.stem for path in (conf_dir() / "robot").glob("*.yaml")]
     if metadata.robot not in files:
         raise UserError(f"the policy is for '{metadata.robot}', and conf/robot has only {', '.join(sorted(files))}")
-    changed = ("joints", "end_effector", "home", "command", "command_limit", "position_gain", "gravity")
+    changed = ["joints", "home", "command_limit"]
+    if metadata.floats:
+        changed += ["servo.stiffness", "servo.damping", "floating.height", "floating.friction"]
+    else:
+        changed += ["end_effector", "command", "position_gain", "gravity"]
     return [
         f"robot@env.robot={metadata.robot}",
-        *(f"env.robot.{key}={json.dumps(robot[key])}" for key in changed),
+        *(f"env.robot.{key}={json.dumps(_value(robot, key))}" for key in changed),
         f"env.start.spread={json.dumps([0.0] * len(robot['joints']))}",
     ]
+
+
+def _value(robot: Any, key: str) -> Any:
+    for part in key.split("."):
+        robot = robot[part]
+    return robot

@@ -22,6 +22,7 @@ from physai.errors import UserError
 from physai.ros.live.status import Status
 from physai.ros.topics import goals, joint_states, qos
 from physai.ros.topics.emergency_stop import ALL
+from physai.signals import Quantity
 
 _NODE = "inference_node"
 _MOST = 64  # robots
@@ -193,6 +194,8 @@ class _Link:
         try:
             self._goal, _, _ = read_goal(message.data)
             kind = goals.goal_type(self._goal)
+            if self._goal.quantity is Quantity.TWIST:
+                raise UserError("it follows velocities, which this page does not send")
         except (PolicyError, UserError) as error:
             self._goal = None
             self.say(str(error))
