@@ -24,6 +24,7 @@ from omegaconf import OmegaConf
 
 from physai.compose import compose, conf_dir
 from physai.config import validate
+from physai.deploy import Policy, load_policy
 from physai.envs.simulation import EnvConfig
 from physai.training.config import TrainConfig
 from physai.training.run import load_config, run_training
@@ -203,6 +204,12 @@ def walking_run(once: Callable[[str, Callable[[Path], None]], Path]) -> Path:
     """A run of a robot on legs; short, for it walks from the first frame on."""
     short = ("total_frames=12_288", "env.task.max_steps=100", "evaluation.goals=20")
     return once("walking_run", partial(_train_and_export, "env=a1_walk", "physics=mujoco", *short))
+
+
+@pytest.fixture(scope="session")
+def walking_policy(walking_run: Path) -> Policy:
+    """Its policy: loaded once, not to be changed."""
+    return load_policy(walking_run / "policy.pt")
 
 
 def _train_and_export(*arguments: Any) -> None:

@@ -23,12 +23,6 @@ def position_policy(position_run) -> Policy:
 
 
 @pytest.fixture(scope="session")
-def walking_policy(walking_run) -> Policy:
-    """The same, of a robot on legs."""
-    return load_policy(walking_run / "policy.pt")
-
-
-@pytest.fixture(scope="session")
 def content(exported_run) -> bytes:
     return (exported_run / "policy.pt").read_bytes()
 
