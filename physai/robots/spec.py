@@ -2,11 +2,11 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import Field
-from urdf_parser_py.urdf import Joint, Robot
+from urdf_parser_py.urdf import Joint, JointLimit, Robot
 
 from physai.collision import CollisionModel
 from physai.config import Config, NonNegativeFloat, PositiveFloat, nearest
@@ -18,16 +18,24 @@ from physai.robots.floating import FloatingBase, FloatingConfig, Servo, ServoCon
 from physai.signals import Quantity, Signal
 
 
+class LimitsConfig(Config):
+    """Of joints, one value each: ``position``, lowest and highest, rad; ``velocity``, rad/s; ``effort``, N·m."""
+
+    position: list[Annotated[list[float], Field(min_length=2, max_length=2)]]
+    velocity: list[PositiveFloat]
+    effort: list[PositiveFloat]
+
+
 class RobotConfig(Config):
     """One file of ``conf/robot``.
 
     ``command`` says what drives the joints, and ``command_limit`` what an action of 1 means to each: with ``action:
     speed`` how fast it moves, rad/s, with ``action: offset`` how far from home it goes, rad. Joints that take positions
     either close in on them at ``position_gain``, 1/s, or are the springs of ``servo``. What follows stands in the place
-    of what the URDF says, or does not say: ``damping``, N·m·s/rad, and ``friction``, N·m, one value a joint, and
-    ``inertials`` of links by name. ``gravity`` is in the base's frame, m/s²: it says how the base is mounted. Without
-    ``collision`` nobody asks whether the robot touches itself. ``floating`` is of a base that nothing holds; a robot
-    that has none needs an ``end_effector``.
+    of what the URDF says, or does not say: ``limits``, ``damping``, N·m·s/rad, and ``friction``, N·m, one value a
+    joint, and ``inertials`` of links by name. ``gravity`` is in the base's frame, m/s²: it says how the base is
+    mounted. Without ``collision`` nobody asks whether the robot touches itself. ``floating`` is of a base that nothing
+    holds; a robot that has none needs an ``end_effector``.
     """
 
     name: str
@@ -41,6 +49,7 @@ class RobotConfig(Config):
     position_gain: PositiveFloat
     servo: ServoConfig | None
     floating: FloatingConfig | None
+    limits: LimitsConfig | None
     damping: list[NonNegativeFloat] | None
     friction: list[NonNegativeFloat] | None
     gravity: list[float] = Field(min_length=3, max_length=3)
@@ -176,6 +185,8 @@ class RobotSpec:
                 f"{on_chain}, not {list(config.joints)}"
             )
         joints = [by_name[name] for name in config.joints]
+        if config.limits is not None:
+            _give_limits(joints, config.limits, config.name)
         for joint in joints:
             _check_driven(path, joint)
         per_joint = {key: getattr(config, key) for key in ("home", "command_limit", "damping", "friction")}
@@ -258,6 +269,17 @@ def _links_below(joint: str, joints: list[Joint], by_name: dict[str, Joint]) -> 
     return below
 
 
+def _give_limits(joints: list[Joint], limits: LimitsConfig, name: str) -> None:
+    for key, values in vars(limits).items():
+        if len(values) != len(joints):
+            raise UserError(f"robot '{name}': limits.{key} has {len(values)} values for {len(joints)} joints")
+    told = zip(joints, limits.position, limits.velocity, limits.effort, strict=True)
+    for joint, (lower, upper), velocity, effort in told:
+        joint.limit = JointLimit(effort, velocity, lower, upper)
+        if joint.type == "continuous":
+            joint.type = "revolute"
+
+
 def _check_driven(path: Path, joint: Joint) -> None:
     where = f"{path}: joint '{joint.name}'"
     if joint.type not in ("revolute", "continuous"):
@@ -265,7 +287,7 @@ def _check_driven(path: Path, joint: Joint) -> None:
     if joint.axis is not None and not any(joint.axis):
         raise UserError(f"{where}: its <axis> is zero")
     if joint.limit is None:
-        raise UserError(f"{where} has no <limit>: effort and velocity are needed")
+        raise UserError(f"{where} has no <limit>: effort and velocity are needed; the robot's YAML may give 'limits'")
     if not (joint.limit.effort or 0) > 0 or not (joint.limit.velocity or 0) > 0:
         raise UserError(f"{where}: the effort and velocity of its <limit> must be positive")
     lower, upper = _position_limit(joint)
