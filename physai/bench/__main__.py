@@ -24,6 +24,7 @@ PARTS = {
     "update": "learning from a batch, against PPO written by hand",
     "training": "time to 99 percent of unseen goals, against the PPO of Stable-Baselines3, rsl_rl and SBX",
     "algorithms": "time to 95 percent of unseen goals of every algorithm, against Stable-Baselines3's of the same name",
+    "walk": "legs: collection against bare MuJoCo, and where the time and the memory of a training go",
     "arms": "time to 95 percent of a Panda's unseen goals, against PPO, and TQC with hindsight replay",
     "identify": "what is found of hidden robots by their recordings, in the same engine and in another, and how soon",
     "identified": "policies trained for a hidden robot as its recording shows it, against those for any, on the robot",
@@ -39,6 +40,7 @@ NEEDS = {  # the extra that a part needs, and its modules
     "arms": ("bench,mujoco", ["sb3_contrib", "panda_gym", "mujoco"]),
     "collection": ("ray", ["ray"]),
     "engines": ("mujoco", ["mujoco"]),
+    "walk": ("bench,mujoco", ["psutil", "mujoco"]),
     "identify": ("mujoco", ["mujoco"]),
     "identified": ("mujoco", ["mujoco"]),
     "growth": ("bench", ["psutil"]),
@@ -65,8 +67,8 @@ def main() -> None:
 def _options() -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         prog="python -m physai.bench",
-        description="Measure physai on the two-link arm and a Panda, side by side with what it is compared to: the "
-        "parts that are named, or all of them, which takes almost two hours.",
+        description="Measure physai on the two-link arm, a Panda and legs, side by side with what it is compared to: "
+        "the parts that are named, or all of them, which takes almost two hours.",
     )
     for part, meaning in PARTS.items():
         parser.add_argument(f"--{part}", dest="parts", action="append_const", const=part, help=meaning)

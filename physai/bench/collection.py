@@ -56,7 +56,7 @@ def measure_collectors(seed: int) -> dict[str, float]:
         config = reacher(seed, f"collector={name}")
         torch.set_num_threads(config.threads)
         size = config.collector
-        with _collection(config, size.num_envs, size.processes) as side:
+        with collecting(config, size.num_envs, size.processes) as side:
             (speeds[name],) = median_speeds(side, rounds=ROUNDS)
         print(f"collector={name}: {speeds[name]:,.0f}/s", flush=True)
     return speeds
@@ -69,14 +69,14 @@ def _collection_speeds(config: TrainConfig, robots: int) -> list[float]:
     commands = spec.command_limit * np.random.default_rng(config.seed).uniform(-1, 1, shape)
     with (
         bare_loop(spec, config.env.control_dt, commands) as bare,
-        _collection(config, robots, processes=1) as one,
-        _collection(config, robots, processes=2) as two,
+        collecting(config, robots, processes=1) as one,
+        collecting(config, robots, processes=2) as two,
     ):
         return median_speeds(bare, one, two, rounds=ROUNDS)
 
 
 @contextmanager
-def _collection(config: TrainConfig, robots: int, processes: int) -> Iterator[Callable[[], int]]:
+def collecting(config: TrainConfig, robots: int, processes: int) -> Iterator[Callable[[], int]]:
     """Make what a learner waits for: batches from so many robots in each process."""
     batches = 1 if robots < SMALL else STEPS_PER_ROUND * config.collector.num_envs // config.collector.frames_per_batch
     frames = STEPS_PER_ROUND // batches * robots * processes

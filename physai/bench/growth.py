@@ -1,5 +1,6 @@
 """What a run costs as it grows: time and memory against frames, and against robots."""
 
+import csv
 import json
 import subprocess
 import sys
@@ -23,12 +24,23 @@ LOOK_EVERY = 0.2  # s; a look takes milliseconds
 
 @dataclass(frozen=True)
 class Run:
-    """What one run took: its loop alone, and the most memory that its processes had together."""
+    """What one run took.
+
+    Attributes:
+        frames: Of its training.
+        robots: That they are from.
+        seconds: Of its loop alone.
+        megabytes: The most memory that its processes had together.
+        waited: s, in which its learner had no batch.
+        learned: s, in which it learned.
+    """
 
     frames: int
     robots: int
     seconds: float
     megabytes: float
+    waited: float
+    learned: float
 
 
 def run(options: Namespace) -> Table:
@@ -42,18 +54,20 @@ def run(options: Namespace) -> Table:
 def measure_growth(seed: int) -> tuple[list[Run], list[Run]]:
     """Train with ever more frames, and with ever more robots; each run is a process of its own."""
     robots = reacher(seed).collector.num_envs
-    by_frames = [_run(frames, robots, seed) for frames in FRAMES]
-    return by_frames, [_run(ROBOTS_FRAMES, robots, seed) for robots in ROBOTS]
+    by_frames = [train_apart("reacher", frames, robots, seed) for frames in FRAMES]
+    return by_frames, [train_apart("reacher", ROBOTS_FRAMES, robots, seed) for robots in ROBOTS]
 
 
-def _run(frames: int, robots: int, seed: int) -> Run:
+def train_apart(env: str, frames: int, robots: int, seed: int, *overrides: str) -> Run:
+    """Train in a process of its own, and see how long that takes, and how much memory."""
     with tempfile.TemporaryDirectory() as folder:
         command = [
-            *(sys.executable, "-m", "physai.train", "env=reacher", f"seed={seed}", f"hydra.run.dir={folder}"),
+            *(sys.executable, "-m", "physai.train", f"env={env}", f"seed={seed}", f"hydra.run.dir={folder}"),
             *(f"total_frames={frames}", f"collector.num_envs={robots}"),
             "evaluation.episodes=100",  # the thousand robots of the final evaluation would hide the others
             "evaluation.in_a_row=0",  # which takes longer than the loop, and is not on its clock
             "export.formats=[]",  # whose memory is the same for all
+            *overrides,
         ]
         megabytes = 0.0
         with open(Path(folder) / "said.txt", "w+") as said:
@@ -69,7 +83,10 @@ def _run(frames: int, robots: int, seed: int) -> Run:
                 said.seek(0)
                 raise UserError(f"training failed: {said.read()[-1000:]}")
         summary = json.loads((Path(folder) / "summary.json").read_text())
-    run = Run(summary["frames"], robots, summary["train_seconds"], megabytes)
+        with open(Path(folder) / "metrics.csv") as file:
+            phases = [(float(row["time/collect"]), float(row["time/update"])) for row in csv.DictReader(file)]
+    waited, learned = (sum(each) for each in zip(*phases, strict=True))
+    run = Run(summary["frames"], robots, summary["train_seconds"], megabytes, waited, learned)
     print(f"{run.frames:>9,} frames, {robots:>5,} robots: {run.seconds:6.1f} s, {run.megabytes:,.0f} MB", flush=True)
     return run
 
