@@ -146,6 +146,7 @@ def test_any_chain_of_turned_joints_matches_pybullet(tmp_path, seed):
         position_gain=20.0,
         servo=None,
         floating=None,
+        limits=None,
         damping=None,
         friction=None,
         gravity=[0.0, 0.0, -9.81],
