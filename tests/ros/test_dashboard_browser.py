@@ -63,7 +63,6 @@ def drag(page, seen, end, done):
 
 
 @pytest.mark.slow
-@pytest.mark.realtime
 def test_a_goal_that_is_dragged_is_reached_a_stuck_arm_says_so_and_stop_all_stops_it(page, arm, peer, tmp_path):
     wait_until(lambda: len(colored(picture(page), *GREEN)) > 50, 60.0)
     time.sleep(1.0)
