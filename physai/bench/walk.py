@@ -12,9 +12,12 @@ from rich.table import Table
 from physai.bench.collection import STEPS_PER_ROUND, collecting
 from physai.bench.growth import Run, train_apart
 from physai.bench.timing import config_of, median_speeds, table
+from physai.envs.make import make_env
+from physai.physics.interface import at_home
 from physai.physics.mujoco import MuJoCoPhysics
 from physai.robots import RobotSpec
 from physai.targets import make
+from physai.training.agent import make_actor
 from physai.training.config import TrainConfig
 
 ENV, ENGINE = "a1_walk", "physics=mujoco"
@@ -53,16 +56,15 @@ def bare_batch(config: TrainConfig, robots: int) -> Iterator[Callable[[], int]]:
     """Make the least that one can do with MuJoCo's batch: command and step the same model, on one thread.
 
     Yields:
-        A function that plays commands about home and returns the number of robot-steps.
+        A function that lets robots walk from home on, as an untrained policy told them, and returns the number of
+        robot-steps.
     """
     env, spec = config.env, RobotSpec.from_config(config.env.robot)
     physics: MuJoCoPhysics = make("env.physics", env.physics, spec, robots, env.control_dt, env.substeps)
-    batch = physics._batch
-    # As small as those of a policy that begins to learn: robots that fall lie still, which is another work.
-    shape = (STEPS_PER_ROUND, robots, len(spec.joints))
-    commands = spec.home + 0.1 * spec.command_limit * np.random.default_rng(config.seed).uniform(-1, 1, shape)
+    batch, commands = physics._batch, _walked(config, robots)
 
     def play() -> int:
+        physics.reset(np.arange(robots), at_home(spec, robots))
         for command in commands:
             batch.ctrl = command
             batch.step(nstep=env.substeps)
@@ -72,6 +74,19 @@ def bare_batch(config: TrainConfig, robots: int) -> Iterator[Callable[[], int]]:
         yield play
     finally:
         physics.close()
+
+
+@torch.no_grad()
+def _walked(config: TrainConfig, robots: int) -> list[np.ndarray]:
+    """What robots are told in a round, rad, [N, n] each."""
+    env = make_env(config.env, config.randomization, config.normalization, robots, config.seed)
+    actor, commands = make_actor(config, env), []
+    tensordict = env.reset()
+    for _ in range(STEPS_PER_ROUND):
+        tensordict = env.step(actor(tensordict)).get("next")
+        commands.append(env.simulation.last_command)
+    env.close()
+    return commands
 
 
 def walk_table(speeds: dict[int, list[float]]) -> Table:
