@@ -173,10 +173,8 @@ class Peer:
             self._executor.spin()
         except ExternalShutdownException:
             pass
-        except (
-            RuntimeError,
-            AttributeError,
-        ):  # RCLError: the context ended while it began to wait; or what it waits for
+        except (RuntimeError, AttributeError):
+            # RCLError, or rclpy's own slip: the context ended while it began to wait.
             if self._context.ok():
                 raise
 

@@ -9,7 +9,7 @@ from tests.ros.loop import Arm
 from tests.ros.peer import wait_for
 from tests.ros.test_dashboard import dashboard
 from tests.web.conftest import browser  # noqa: F401  # a fixture
-from tests.web.test_play import GREEN, REACH, Camera, colored, drawn, picture, wait_until
+from tests.web.test_play import GREEN, REACH, Camera, colored, drag_along_y, picture, wait_until
 
 SIZE = {"width": 1000, "height": 640}
 SEEN_FROM = ((0.0, -0.9 * REACH, 1.1 * REACH), (0.0, 0.0, 0.0))  # of one robot
@@ -41,19 +41,10 @@ def goal_of(page, seen):
 
 
 def drag(page, seen, end, done):
-    """Take the goal by the arrow along the axis y, and let go of it at ``end``; again, if the page was too slow."""
+    """Drag the goal to another y until something is done; again, if the page was too slow."""
 
     def try_it():
-        box = page.locator("canvas").first.bounding_box()
-        start = goal_of(page, seen)
-        for share in np.linspace(0.0, 1.0, 8):
-            across, down = seen.pixel(start[0], start[1] + 0.08 + share * (end - start[1]))
-            page.mouse.move(box["x"] + across, box["y"] + down)
-            drawn(page)
-            if share == 0.0:
-                page.mouse.down()
-                drawn(page)
-        page.mouse.up()
+        drag_along_y(page, seen, goal_of(page, seen), end)
         deadline = time.monotonic() + 3.0
         while not (found := done()) and time.monotonic() < deadline:
             time.sleep(0.1)

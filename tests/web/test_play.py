@@ -73,6 +73,19 @@ def drawn(page):
     page.wait_for_timeout(50)
 
 
+def drag_along_y(page, seen, start, end):
+    """Take a goal by the arrow that shows the axis y, and let go of it at ``end``."""
+    box = page.locator("canvas").first.bounding_box()
+    for share in np.linspace(0.0, 1.0, 8):
+        across, down = seen.pixel(start[0], start[1] + 0.08 + share * (end - start[1]))
+        page.mouse.move(box["x"] + across, box["y"] + down)
+        drawn(page)
+        if share == 0.0:
+            page.mouse.down()
+            drawn(page)
+    page.mouse.up()
+
+
 def wait_until(condition, seconds=20.0):
     end = time.monotonic() + seconds
     while not (found := condition()):
@@ -105,15 +118,7 @@ def test_an_arm_follows_the_goal_that_the_mouse_drags_and_stands_still_when_paus
 
     # Along the arrow that shows the axis y, to another place.
     there = -0.2
-    box = page.locator("canvas").first.bounding_box()
-    for share in np.linspace(0.0, 1.0, 8):
-        across, down = seen.pixel(x, y + 0.08 + share * (there - y))
-        page.mouse.move(box["x"] + across, box["y"] + down)
-        drawn(page)
-        if share == 0.0:
-            page.mouse.down()
-            drawn(page)
-    page.mouse.up()
+    drag_along_y(page, seen, (x, y), there)
     wait_until(lambda: np.abs(goal_of(page, seen) - [x, there]).max() < 0.1, 30.0)
     wait_until(lambda: distance(page) < 0.05)
     time.sleep(1.0)
