@@ -14,10 +14,11 @@ import physai
 from physai.artifact.module import DeployablePolicy
 from physai.artifact.states import States
 from physai.collision import CollisionModel
+from physai.deploy.kinematics import Kinematics
 from physai.deploy.metadata import FORMAT, FORMAT_VERSION, describe_region, describe_signal
 from physai.envs.simulation import Simulation
 from physai.robots import RobotSpec
-from physai.robots.chain import motions
+from physai.robots.chain import carried
 
 
 def describe_robot(simulation: Simulation, policy: DeployablePolicy) -> dict[str, Any]:
@@ -45,15 +46,24 @@ def describe_robot(simulation: Simulation, policy: DeployablePolicy) -> dict[str
             "region": describe_region(task.region),
             "tolerances": [vars(tolerance) for tolerance in task.tolerances],
         },
-        **({"kinematics": _kinematics(spec)} if spec.end_effector else {}),
+        "kinematics": kinematics(spec).describe(),
         "collision": None if (model := capsules(simulation)) is None else model.describe(),
     }
 
 
-def _kinematics(spec: RobotSpec) -> dict[str, Any]:
-    """What each joint moves, and where the end effector is in the frame of the last: for pictures."""
-    moves, tip = motions(spec.chain, spec.joints)
-    return {key: getattr(moves, key).tolist() for key in ("constant", "cosine", "sine")} | {"tip": tip.tolist()}
+def kinematics(spec: RobotSpec) -> Kinematics:
+    """Return what each joint of a robot moves, and where its links end."""
+    if (tip := spec.tip) is not None:
+        return Kinematics(spec.motions, ((len(spec.joints), tip),))
+    assert spec.floating is not None
+    links, feet = carried(spec.linkage, spec.base, spec.joints), []
+    for sphere in spec.floating.spheres:
+        if sphere.link in spec.floating.foot_links:
+            body, frame = links[sphere.body]
+            end = np.eye(4)
+            end[:3, 3] = frame[:3, :3] @ sphere.center + frame[:3, 3]
+            feet.append((body, end))
+    return Kinematics(spec.motions, tuple(feet), spec.floating.height)
 
 
 def capsules(simulation: Simulation) -> CollisionModel | None:

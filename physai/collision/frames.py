@@ -10,20 +10,23 @@ class Motions:
     """What each driven joint does to the points of the body that it moves.
 
     By Rodrigues' formula a turning joint is ``M(q) = A + B cos(q) + C sin(q)``; A also holds the fixed transform before
-    the joint. Body k's frame is the product of the first k of these; body 0's is the base's.
+    the joint. Body k + 1's frame is that of the body which carries joint k, times this; body 0's is the base's.
 
     Attributes:
         constant: A, [n, 4, 4].
         cosine: B, [n, 4, 4].
         sine: C, [n, 4, 4].
+        carriers: Which body carries each joint, [n], such as the base for the first joint of each leg; empty of an arm,
+            whose bodies carry one joint each.
 
     Raises:
-        ValueError: If they are not of that shape, or a number is not finite.
+        ValueError: If they are not of that shape, a number is not finite, or a carrier comes after what it carries.
     """
 
     constant: np.ndarray
     cosine: np.ndarray
     sine: np.ndarray
+    carriers: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
         for key in ("constant", "cosine", "sine"):
@@ -39,6 +42,10 @@ class Motions:
         if not len(self.constant) == len(self.cosine) == len(self.sine):
             counts = len(self.constant), len(self.cosine), len(self.sine)
             raise ValueError(f"motions: constant, cosine and sine are of {counts} joints")
+        carriers = self.carriers or tuple(range(len(self)))
+        if len(carriers) != len(self) or not all(0 <= body <= joint for joint, body in enumerate(carriers)):
+            raise ValueError(f"motions: carriers must be a body for each joint that comes before it, not {carriers}")
+        object.__setattr__(self, "carriers", carriers)
 
     def __len__(self) -> int:
         return len(self.constant)
@@ -60,6 +67,6 @@ class Motions:
         motion += self.constant[..., np.newaxis]  # [n, 4, 4, N]
         frames = np.empty((len(self) + 1, 3, 4, len(joint_position)))
         frames[0] = np.eye(4)[:3, :, np.newaxis]
-        for before, moved, after in zip(frames[:-1], motion, frames[1:], strict=True):
-            np.add.reduce(before[:, :, np.newaxis] * moved, axis=1, out=after)
+        for carrier, moved, after in zip(self.carriers, motion, frames[1:], strict=True):
+            np.add.reduce(frames[carrier][:, :, np.newaxis] * moved, axis=1, out=after)
         return frames

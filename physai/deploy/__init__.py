@@ -9,9 +9,10 @@ from physai.deploy.goals import Goal
 from physai.deploy.imu import Imu
 from physai.deploy.joints import JointState
 from physai.deploy.legged import LeggedController, make_controller
-from physai.deploy.metadata import Metadata, PolicyError
+from physai.deploy.metadata import Metadata
 from physai.deploy.parameters import ControllerConfig
 from physai.deploy.policy import Driver, Policy, load_policy, read_metadata
+from physai.deploy.reading import PolicyError
 
 __all__ = [
     "Command",

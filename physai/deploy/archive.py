@@ -7,7 +7,7 @@ import zipfile
 from pathlib import Path
 from typing import NamedTuple
 
-from physai.deploy.metadata import PolicyError
+from physai.deploy.reading import PolicyError
 
 METADATA = "metadata.json"  # its name among TorchScript's extra files and among ONNX's metadata_props
 MAX_BYTES = 64 * 2**20

@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from physai.collision import CollisionModel, Motions
-from physai.errors import UserError
+from physai.collision import CollisionModel
+from physai.deploy.kinematics import Kinematics
+from physai.deploy.reading import PolicyError, all_numbers, array, get, items, positive
 from physai.signals import Quantity, Region, Signal, Tolerance
 from physai.signals.region import REGIONS
 
@@ -35,14 +36,6 @@ _FOR_PEOPLE = {
 }
 
 
-class PolicyError(UserError):
-    """A policy file that cannot be trusted or does not fit: one line that says why."""
-
-    def __init__(self, message: str) -> None:
-        # It may quote the file: no line breaks, no control characters for the terminal that shows it.
-        super().__init__("".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in message))
-
-
 @dataclass(frozen=True, eq=False)
 class Metadata:
     """The checked part of a policy's metadata; ``raw`` has all of it.
@@ -62,8 +55,7 @@ class Metadata:
         outputs: What it gives, in order; first the command.
         region: Where goals lie.
         tolerances: Errors that count as reached, one for each error that the policy tells.
-        kinematics: What each joint moves, and the end effector's frame in that of the last one, 4 x 4: for pictures.
-            None in files that do not tell.
+        kinematics: What each joint moves; None in files that do not tell.
         collision: The robot's capsules, and what it was trained not to touch; None where it has none.
         golden: Inputs, and the outputs and errors that the policy gave for them when it was exported, by name; float32,
             [pairs, ...].
@@ -84,7 +76,7 @@ class Metadata:
     outputs: tuple[Signal, ...]
     region: Region
     tolerances: tuple[Tolerance, ...]
-    kinematics: tuple[Motions, np.ndarray] | None
+    kinematics: Kinematics | None
     collision: CollisionModel | None
     golden: dict[str, np.ndarray]
     content_sha256: str
@@ -127,49 +119,49 @@ class Metadata:
                 f"format version {repr(raw.get('format_version'))[:80]}; this physai reads {FORMAT_VERSION}: "
                 "export the policy again with it"
             )
-        joints = _get(raw, "robot.joints", list)
+        joints = get(raw, "robot.joints", list)
         if not joints or not all(isinstance(name, str) for name in joints) or len(set(joints)) != len(joints):
             raise PolicyError("metadata: robot.joints must be distinct names")
         n = len(joints)
-        position = _array(raw, "limits.position", (n, 2), null=[-math.inf, math.inf])
+        position = array(raw, "limits.position", (n, 2), null=[-math.inf, math.inf])
         if not (position[:, 0] < position[:, 1]).all():
             raise PolicyError("metadata: limits.position must be pairs of lower and upper limit")
-        inputs = tuple(_signal(raw, key) for key in _items(raw, "inputs", 32, "signals"))
-        outputs = tuple(_signal(raw, key) for key in _items(raw, "outputs", 32, "signals"))
+        inputs = tuple(_signal(raw, key) for key in items(raw, "inputs", 32, "signals"))
+        outputs = tuple(_signal(raw, key) for key in items(raw, "outputs", 32, "signals"))
         floats = raw["robot"].get("base") == "floating"
         _check_signals(inputs, outputs, tuple(joints), floats)
         goal = next(signal for signal in inputs if signal.name == GOAL)
         region, tolerances = _asked(raw, goal)
         for key, kind in _FOR_PEOPLE.items():
-            _get(raw, key, kind)
-        pairs = len(_get(raw, f"golden.{outputs[0].name}", list))
+            get(raw, key, kind)
+        pairs = len(get(raw, f"golden.{outputs[0].name}", list))
         if not 0 < pairs <= MAX_PAIRS:
             raise PolicyError(f"metadata: there are {pairs:,} golden pairs, not 1 to {MAX_PAIRS:,}")
         shapes = {signal.name: (pairs, *signal.shape) for signal in (*inputs, *outputs)}
         shapes |= {ERROR: (pairs, len(tolerances))} if ERROR in raw["golden"] or not floats else {}
         found = cls(
             raw=raw,
-            robot=_get(raw, "robot.name", str),
+            robot=get(raw, "robot.name", str),
             joints=tuple(joints),
             floats=floats,
-            home=_array(raw, "robot.home", (n,)),
+            home=array(raw, "robot.home", (n,)),
             position_limit=position,
-            velocity_limit=_positive(raw, "limits.velocity", (n,)),
-            effort_limit=_positive(raw, "limits.effort", (n,)),
-            command_limit=_positive(raw, "limits.command", (n,)),
-            control_rate=float(_positive(raw, "control_rate", (), 1e4)),
+            velocity_limit=positive(raw, "limits.velocity", (n,)),
+            effort_limit=positive(raw, "limits.effort", (n,)),
+            command_limit=positive(raw, "limits.command", (n,)),
+            control_rate=float(positive(raw, "control_rate", (), 1e4)),
             inputs=inputs,
             outputs=outputs,
             region=region,
             tolerances=tolerances,
-            kinematics=_kinematics(raw, n),
+            kinematics=Kinematics.read(raw, n),
             collision=_collision(raw, n),
-            golden={key: _array(raw, f"golden.{key}", shape, kind=np.float32) for key, shape in shapes.items()},
-            content_sha256=_get(raw, "content_sha256", str),
+            golden={key: array(raw, f"golden.{key}", shape, kind=np.float32) for key, shape in shapes.items()},
+            content_sha256=get(raw, "content_sha256", str),
         )
         if not floats and not (found.command_limit <= found.velocity_limit).all():
             raise PolicyError("metadata: limits.command must not be beyond limits.velocity")
-        if _get(raw, "metadata_sha256", str) != metadata_sha256(raw):
+        if get(raw, "metadata_sha256", str) != metadata_sha256(raw):
             raise PolicyError("the metadata is not what was exported (metadata_sha256 differs)")
         return found
 
@@ -219,49 +211,27 @@ def metadata_sha256(raw: dict[str, Any]) -> str:
     return hashlib.sha256(json.dumps(rest, sort_keys=True).encode()).hexdigest()
 
 
-def _get(raw: dict[str, Any], key: str, kind: type) -> Any:
-    value: Any = raw
-    for part in key.split("."):
-        if isinstance(value, list) and part.isdigit():
-            value = value[int(part)]
-        elif isinstance(value, dict) and part in value:
-            value = value[part]
-        else:
-            raise PolicyError(f"metadata: {key} is missing")
-    if not isinstance(value, kind):
-        raise PolicyError(f"metadata: {key} must be a {kind.__name__}")
-    return value
-
-
-def _items(raw: dict[str, Any], key: str, most: int, what: str) -> list[str]:
-    """Keys of the items of a list."""
-    count = len(_get(raw, key, list))
-    if not 0 < count <= most:
-        raise PolicyError(f"metadata: {key} must be a list of {what}")
-    return [f"{key}.{number}" for number in range(count)]
-
-
 def _signal(raw: dict[str, Any], key: str) -> Signal:
-    name, quantity = _get(raw, f"{key}.name", str), _get(raw, f"{key}.quantity", str)
+    name, quantity = get(raw, f"{key}.name", str), get(raw, f"{key}.quantity", str)
     if not name.isidentifier() or len(name) > 100:
         raise PolicyError(f"metadata: {key}.name must be an identifier, not {name!r:.80}")
     if quantity not in [known.value for known in Quantity]:
         raise PolicyError(f"metadata: {key}.quantity: this physai does not know {quantity!r:.80}")
-    shape = _get(raw, f"{key}.shape", list)
+    shape = get(raw, f"{key}.shape", list)
     if not shape or len(shape) > 8 or not all(type(length) is int and 0 < length <= MAX_SIZE for length in shape):
         raise PolicyError(f"metadata: {key}.shape must be positive integers")
     size = math.prod(shape)
     if size > MAX_SIZE:
         raise PolicyError(f"metadata: {key} has {size:,} numbers, more than {MAX_SIZE:,}")
     low, high = _bounds(raw, f"{key}.low", size, -math.inf), _bounds(raw, f"{key}.high", size, math.inf)
-    labels = _get(raw, f"{key}.labels", list)
+    labels = get(raw, f"{key}.labels", list)
     if len(labels) not in (0, size) or not all(isinstance(label, str) for label in labels):
         raise PolicyError(f"metadata: {key}.labels must be {size} names, or none")
     if len(set(labels)) != len(labels):  # a goal that is said by name would lose a number
         raise PolicyError(f"metadata: {key}.labels must be distinct")
-    frame = _get(raw, f"{key}.frame", str)
+    frame = get(raw, f"{key}.frame", str)
     signal = Signal(name, Quantity(quantity), tuple(shape), low, high, tuple(labels), frame)
-    if _get(raw, f"{key}.unit", str) != signal.unit:
+    if get(raw, f"{key}.unit", str) != signal.unit:
         raise PolicyError(f"metadata: {key}.unit must be '{signal.unit}'")
     if not (signal.bounds[0] <= signal.bounds[1]).all():
         raise PolicyError(f"metadata: {key}.low must not be above {key}.high")
@@ -269,7 +239,7 @@ def _signal(raw: dict[str, Any], key: str) -> Signal:
 
 
 def _bounds(raw: dict[str, Any], key: str, size: int, infinite: float) -> tuple[float, ...]:
-    return tuple(_array(raw, key, (size,), null=infinite).tolist()) if _get(raw, key, list) else ()
+    return tuple(array(raw, key, (size,), null=infinite).tolist()) if get(raw, key, list) else ()
 
 
 def _check_signals(
@@ -303,7 +273,7 @@ def _check_signals(
 
 
 def _asked(raw: dict[str, Any], goal: Signal) -> tuple[Region, tuple[Tolerance, ...]]:
-    tolerances = tuple(_tolerance(raw, key) for key in _items(raw, "goal.tolerances", 1000, "tolerances"))
+    tolerances = tuple(_tolerance(raw, key) for key in items(raw, "goal.tolerances", 1000, "tolerances"))
     region = _region(raw)
     most = float(np.abs(region.bounds).max())
     if any(each.unit == goal.unit and each.value > most for each in tolerances):
@@ -314,11 +284,11 @@ def _asked(raw: dict[str, Any], goal: Signal) -> tuple[Region, tuple[Tolerance, 
 
 
 def _region(raw: dict[str, Any]) -> Region:
-    told = dict(_get(raw, "goal.region", dict))
+    told = dict(get(raw, "goal.region", dict))
     kind = told.pop("kind", None)
     if not isinstance(kind, str) or kind not in REGIONS:
         raise PolicyError(f"metadata: goal.region.kind: this physai does not know {kind!r:.80}")
-    if len(told) > 16 or not all(_all_numbers(value) and value is not None for value in told.values()):
+    if len(told) > 16 or not all(all_numbers(value) and value is not None for value in told.values()):
         raise PolicyError("metadata: goal.region must hold numbers")
     try:
         with np.errstate(over="ignore"):
@@ -330,16 +300,8 @@ def _region(raw: dict[str, Any]) -> Region:
         raise PolicyError(f"metadata: goal.region: {' '.join(str(error).split())[:120]}") from error
 
 
-def _kinematics(raw: dict[str, Any], joints: int) -> tuple[Motions, np.ndarray] | None:
-    if "kinematics" not in raw:
-        return None
-    keys = ("constant", "cosine", "sine")
-    moves = Motions(*(_array(raw, f"kinematics.{key}", (joints, 4, 4)) for key in keys))
-    return moves, _array(raw, "kinematics.tip", (4, 4))
-
-
 def _collision(raw: dict[str, Any], joints: int) -> CollisionModel | None:
-    told = _get(raw, "collision", object)
+    told = get(raw, "collision", object)
     if told is None:
         return None
     try:
@@ -355,46 +317,9 @@ def _collision(raw: dict[str, Any], joints: int) -> CollisionModel | None:
 
 
 def _tolerance(raw: dict[str, Any], key: str) -> Tolerance:
-    name, unit = _get(raw, f"{key}.name", str), _get(raw, f"{key}.unit", str)
-    return Tolerance(name, unit, float(_positive(raw, f"{key}.value", ())))
-
-
-def _array(
-    raw: dict[str, Any],
-    key: str,
-    shape: tuple[int, ...],
-    kind: type = np.float64,
-    null: float | list[float] | None = None,  # what null stands for: JSON has no infinity
-) -> np.ndarray:
-    value = _get(raw, key, object)
-    try:
-        if not _all_numbers(value):
-            raise TypeError
-        with np.errstate(over="ignore"):
-            array: np.ndarray = np.array(value, dtype=np.float64).astype(kind)
-    except (TypeError, ValueError, OverflowError, RecursionError) as error:
-        raise PolicyError(f"metadata: {key} must hold numbers") from error
-    if array.shape != shape:
-        raise PolicyError(f"metadata: {key} must have the shape {list(shape)}, not {list(array.shape)}")
-    if null is not None:
-        return np.where(np.isnan(array), null, array)
-    if not np.isfinite(array).all():
-        raise PolicyError(f"metadata: {key} must be finite")
-    return array
-
-
-def _all_numbers(value: Any) -> bool:
-    if isinstance(value, list):
-        return all(map(_all_numbers, value))
-    return value is None or (isinstance(value, int | float) and not isinstance(value, bool))
+    name, unit = get(raw, f"{key}.name", str), get(raw, f"{key}.unit", str)
+    return Tolerance(name, unit, float(positive(raw, f"{key}.value", ())))
 
 
 def _refuse_constant(name: str) -> None:
     raise ValueError(f"{name} is no JSON")
-
-
-def _positive(raw: dict[str, Any], key: str, shape: tuple[int, ...], most: float = math.inf) -> np.ndarray:
-    array = _array(raw, key, shape)
-    if not ((array > 0) & (array <= most)).all():
-        raise PolicyError(f"metadata: {key} must be positive" + (f", and at most {most:g}" if most < math.inf else ""))
-    return array

@@ -12,7 +12,8 @@ import numpy as np
 import torch
 
 from physai.deploy import archive
-from physai.deploy.metadata import ERROR, GOAL, POSITION, Metadata, PolicyError
+from physai.deploy.metadata import ERROR, GOAL, POSITION, Metadata
+from physai.deploy.reading import PolicyError
 
 if TYPE_CHECKING:
     from tensordict.nn import TensorDictModule

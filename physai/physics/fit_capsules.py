@@ -149,7 +149,7 @@ class CapsuleFit:
 
     def _distance(self, config: CollisionConfig, rows: slice) -> np.ndarray:
         spec = self._spec
-        made = model(spec.urdf, self._robot, spec.chain, spec.joints, config)
+        made = model(spec.urdf, self._robot, spec.linkage, spec.joints, config)
         return made.distance(self._joint_position[rows])
 
 

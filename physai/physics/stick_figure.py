@@ -44,7 +44,7 @@ class StickFigure:
         """Return where the arm bends in a pose [n], rad, from base to end effector, m, [points, 3]."""
         position, frame = dict(zip(self._spec.joints, joint_position, strict=True)), np.eye(4)
         points = [frame[:3, 3]]
-        for joint in self._spec.chain:
+        for joint in self._spec.linkage:
             frame = frame @ urdf.transform(joint.origin)
             points.append(frame[:3, 3])
             if joint.name in position:

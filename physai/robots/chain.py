@@ -6,6 +6,7 @@ import numpy as np
 from urdf_parser_py.urdf import Joint
 
 from physai.collision import Motions
+from physai.errors import UserError
 from physai.robots.urdf import transform
 
 
@@ -16,23 +17,27 @@ def axis_of(joint: Joint) -> np.ndarray:
     return direction
 
 
-def motions(chain: Sequence[Joint], driven: Sequence[str]) -> tuple[Motions, np.ndarray]:
-    """Return what each driven joint of a chain does to the points of the link behind it.
+def motions(joints: Sequence[Joint], base: str, driven: Sequence[str]) -> Motions:
+    """Return what each driven joint does to the points of the link behind it.
 
     Args:
-        chain: Joints from the base on; those that are not driven are held at zero.
-        driven: Names of the joints that move, in the order of the chain.
+        joints: Of the whole robot, or of a part that begins at the base; those that are not driven are held at zero.
+        base: The first link.
+        driven: Names of the joints that move; a joint comes after those that carry it.
 
-    Returns:
-        The motions, and the fixed transform from the last driven joint's link to the end of the chain, 4 x 4.
+    Raises:
+        UserError: If one comes before them.
     """
     constant, cosine, sine = np.zeros((3, len(driven), 4, 4))
-    fixed = np.eye(4)
-    row = 0
-    for joint in chain:
-        fixed = fixed @ transform(joint.origin)
-        if joint.name not in driven:
-            continue
+    carriers = carried(joints, base, driven)
+    named = {joint.name: joint for joint in joints}
+    bodies = []
+    for row, name in enumerate(driven):
+        joint = named[name]
+        body, frame = carriers[joint.parent]
+        if body > row:
+            raise UserError(f"joint '{name}' is carried by '{driven[body - 1]}', and must be named after it")
+        fixed = frame @ transform(joint.origin)
         x, y, z = axis_of(joint)
         along = np.outer([x, y, z], [x, y, z])
         across = np.eye(3) - along
@@ -41,8 +46,8 @@ def motions(chain: Sequence[Joint], driven: Sequence[str]) -> tuple[Motions, np.
         constant[row, :3, :3] = fixed[:3, :3] @ along
         cosine[row, :3, :3] = fixed[:3, :3] @ across
         sine[row, :3, :3] = fixed[:3, :3] @ cross
-        fixed, row = np.eye(4), row + 1
-    return Motions(constant, cosine, sine), fixed
+        bodies.append(body)
+    return Motions(constant, cosine, sine, tuple(bodies))
 
 
 def welded(joints: Sequence[Joint], base: str, bodies: Sequence[str]) -> dict[str, tuple[str, np.ndarray]]:

@@ -66,6 +66,6 @@ def model(
             raise UserError(f"collision.pairs.{row}: {pair} must be places among the {len(capsules)} capsules, from 0")
     apart = [(a, b) for a, b in config.pairs if capsules[a].body != capsules[b].body]
     try:
-        return CollisionModel(motions(chain, driven)[0], tuple(capsules), tuple(apart))
+        return CollisionModel(motions(chain, chain[0].parent, driven), tuple(capsules), tuple(apart))
     except ValueError as error:
         raise UserError(f"collision: {error}") from error

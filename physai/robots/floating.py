@@ -78,6 +78,11 @@ class FloatingBase:
     links: tuple[str, ...]
     feet: tuple[int, ...]
 
+    @property
+    def foot_links(self) -> tuple[str, ...]:
+        """Names of the links that it stands on."""
+        return tuple(self.links[foot] for foot in self.feet)
+
     @classmethod
     def from_config(
         cls, config: FloatingConfig, name: str, path: Path, robot: Robot, base: str, bodies: Sequence[Body]

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from physai.robots.chain import axis_of, motions
+from physai.robots.chain import axis_of
 from physai.robots.spec import RobotSpec
 
 
@@ -28,14 +28,15 @@ class ForwardKinematics(nn.Module):
 
     def __init__(self, spec: RobotSpec) -> None:
         super().__init__()
-        motion, fixed = motions(spec.chain, spec.joints)
+        motion, fixed = spec.motions, spec.tip
+        assert fixed is not None, f"'{spec.name}' has no end effector"
         offsets = motion.constant[:, :3, 3].copy()
         constant, cosine, sine = np.zeros((3, len(motion), 8, 4))
         constant[:, :4] = motion.constant
         cosine[:, :4] = sine[:, 4:] = motion.cosine
         sine[:, :4] = cosine[:, 4:] = motion.sine
         sine[:, 4:] *= -1
-        axes = np.array([axis_of(joint) for joint in spec.chain if joint.name in spec.joints])
+        axes = np.array([axis_of(joint) for joint in spec.linkage if joint.name in spec.joints])
         for matrix in (constant, cosine, sine):
             matrix[-1] = matrix[-1] @ fixed  # the last link's frame moves to the tip
         axes[-1] = fixed[:3, :3].T @ axes[-1]

@@ -8,11 +8,12 @@ import numpy as np
 from pydantic import Field
 from urdf_parser_py.urdf import Joint, JointLimit, Robot
 
-from physai.collision import CollisionModel
+from physai.collision import CollisionModel, Motions
 from physai.config import Config, NonNegativeFloat, PositiveFloat, nearest
 from physai.errors import UserError
 from physai.robots import bodies, collision, urdf
 from physai.robots.bodies import Body, InertialConfig
+from physai.robots.chain import carried, motions
 from physai.robots.collision import CollisionConfig
 from physai.robots.floating import FloatingBase, FloatingConfig, Servo, ServoConfig
 from physai.signals import Quantity, Signal
@@ -80,7 +81,7 @@ class RobotSpec:
         damping: N·m·s/rad, [n].
         friction: Coulomb friction, N·m, [n].
         gravity: In the base's frame, m/s², [3].
-        chain: Joints from the base to the end effector, in order; none without an end effector.
+        linkage: Joints from the base to the end effector, in order; all joints of a robot that has none.
         bodies: What engines simulate, from the base on.
         moving_links: Bodies with mass that move, by the name of their first link.
         link_mass: Their masses, kg.
@@ -106,7 +107,7 @@ class RobotSpec:
     damping: np.ndarray
     friction: np.ndarray
     gravity: np.ndarray
-    chain: tuple[Joint, ...]
+    linkage: tuple[Joint, ...]
     bodies: tuple[Body, ...]
     moving_links: tuple[str, ...]
     link_mass: np.ndarray
@@ -132,6 +133,18 @@ class RobotSpec:
         """Draw joint positions [rows, n], rad, uniform within the limits; of a joint without any, a full turn."""
         lower, upper = np.where(self.continuous[:, np.newaxis], [-np.pi, np.pi], self.position_limit).T
         return generator.uniform(lower, upper, (rows, len(self.joints)))
+
+    @property
+    def motions(self) -> Motions:
+        """What each controlled joint moves; the others are held at zero."""
+        return motions(self.linkage, self.base, self.joints)
+
+    @property
+    def tip(self) -> np.ndarray | None:
+        """Frame of the end effector in that of the body which the last joint moves, 4 x 4; None where none is."""
+        if self.end_effector is None:
+            return None
+        return carried(self.linkage, self.base, self.joints)[self.end_effector][1]
 
     @property
     def joint_position(self) -> Signal:
@@ -219,6 +232,7 @@ class RobotSpec:
             floating = FloatingBase.from_config(config.floating, config.name, path, robot, base, together)
             if servo is None:
                 raise UserError(f"robot '{config.name}': a floating base needs joints that are springs: give a servo")
+            motions(robot.joints, base, driven)  # checks their order
         moving = [body for body in together if body.name in below and body.mass]
         for body in together:
             if body.joint is not None and body.joint.name in driven and not body.mass:
@@ -242,7 +256,7 @@ class RobotSpec:
             damping=_dynamics(joints, "damping", config.damping),
             friction=_dynamics(joints, "friction", config.friction),
             gravity=np.array(config.gravity, dtype=np.float64),
-            chain=tuple(chain),
+            linkage=tuple(chain if tip else robot.joints),
             bodies=together,
             moving_links=tuple(body.name for body in moving),
             link_mass=np.array([body.mass for body in moving], dtype=np.float64),

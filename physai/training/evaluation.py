@@ -121,11 +121,13 @@ class Recording:
         joint_position: rad, [T, K, n].
         goal: [K, g].
         success: Whether the episodes were one, [K].
+        base_pose: Of a base that floats: x, y, z, m, and a quaternion x, y, z, w, [T, K, 7]; None of a fixed one.
     """
 
     joint_position: np.ndarray
     goal: np.ndarray
     success: np.ndarray
+    base_pose: np.ndarray | None = None
 
 
 def _mean_and_p99(name: str, values: Tensor) -> dict[str, float]:
@@ -174,6 +176,7 @@ def _one_round(
     error, episode_return = torch.zeros(2, robots)
     mean_error = torch.zeros(robots, len(task.tolerances))
     changes, accelerations, path = [], [], []
+    poses: list[np.ndarray] = []
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         for _ in range(task.max_steps):
             action, velocity = simulation.last_action, simulation.state.joint_velocity
@@ -182,6 +185,8 @@ def _one_round(
             accelerations.append(np.abs(simulation.state.joint_velocity - velocity) / dt)
             if watch is not None:
                 path.append(simulation.state.joint_position[:WATCHED])
+                if simulation.state.base_pose is not None:
+                    poses.append(simulation.state.base_pose[:WATCHED])
             succeeds, steps = tensordict.get("success")[:, 0], tensordict.get("episode_length")[:, 0]
             first = torch.where(succeeds & (first == 0), steps, first)
             crashed |= tensordict.get("terminated")[:, 0] & ~succeeds
@@ -193,7 +198,8 @@ def _one_round(
             mean_error[now] = torch.from_numpy(simulation.error_sum / steps.numpy().clip(1)[:, None]).float()[now]
             episode_return[now] = tensordict.get("episode_rewards").sum(dim=1)[now]
     if watch is not None:
-        watch(Recording(np.stack(path), simulation.goal[:WATCHED], success[:WATCHED].numpy()))
+        pose = np.stack(poses) if poses else None
+        watch(Recording(np.stack(path), simulation.goal[:WATCHED], success[:WATCHED].numpy(), pose))
     stayed = simulation.within >= min(math.ceil(SETTLED / dt - 1e-9), task.max_steps)
     return {
         "success": success,

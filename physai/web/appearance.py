@@ -2,7 +2,7 @@
 
 import hashlib
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import trimesh
@@ -13,7 +13,6 @@ from physai.config import validate
 from physai.deploy import Metadata
 from physai.errors import UserError
 from physai.robots import RobotConfig, RobotSpec
-from physai.robots.chain import motions
 from physai.robots.visuals import plain, visual_bodies
 
 _ORANGE = (242, 115, 31, 255)  # of what stands in for the robot's own shapes
@@ -28,8 +27,8 @@ class Appearance:
         motions: What each driven joint moves.
         bodies: glTF binaries of n + 1 bodies in their frames: of the base, then of what each driven joint moves; None
             where nothing is seen.
-        reach: Length of the stretched robot, m.
-        floor: Where its base stands, m; zero or below.
+        reach: Length of the stretched robot, m; of legs, from the middle of the base on.
+        floor: The lowest point of a fixed base, m; zero or below.
         tip: The end effector's frame in that of the last body, 4 x 4; None where nobody has told.
     """
 
@@ -44,14 +43,13 @@ class Appearance:
         """Read the shapes of a robot's URDF.
 
         Raises:
-            UserError: If a shape is broken, its mesh cannot be found or read, or the robot's base floats.
+            UserError: If a shape is broken, or its mesh cannot be found or read.
         """
-        spec.need_fixed_base("a page in a browser of")
-        moves, tip = motions(spec.chain, spec.joints)
         meshes = visual_bodies(spec.urdf, spec.base, spec.joints)
         if not any(meshes) and spec.collision:
             meshes = _of_model(spec.collision)
-        return cls.of_shapes(moves, meshes, tip)
+        look = cls.of_shapes(spec.motions, meshes, spec.tip)
+        return look if spec.floating is None else replace(look, floor=0.0)
 
     @classmethod
     def of_policy(cls, metadata: Metadata) -> "Appearance":
@@ -112,8 +110,11 @@ def robot_of(metadata: Metadata) -> RobotSpec:
 
 
 def _reach(moves: Motions, tip: np.ndarray) -> float:
-    offsets = [*moves.constant[1:, :3, 3], tip[:3, 3]]
-    return max(float(sum(np.linalg.norm(offset) for offset in offsets)), 0.1)
+    lengths, arm = [0.0], moves.carriers.count(0) == 1
+    for body, place in zip(moves.carriers, moves.constant[:, :3, 3], strict=True):
+        lengths.append(lengths[body] + (0.0 if arm and not body else float(np.linalg.norm(place))))
+    lengths[-1] += float(np.linalg.norm(tip[:3, 3]))
+    return max(*lengths, 0.1)
 
 
 def _of_model(model: CollisionModel) -> list[list[trimesh.Trimesh]]:
@@ -137,10 +138,10 @@ def _of_capsules(bodies: int, capsules: Iterable[Capsule]) -> list[list[trimesh.
 
 
 def _sticks(moves: Motions, tip: np.ndarray) -> list[list[trimesh.Trimesh]]:
-    """From each joint to the next one, and to the end effector."""
-    ends = [*moves.constant[:, :3, 3], tip[:3, 3]]
+    """From each joint to those that it carries, and to the end effector."""
+    ends = [*zip(moves.carriers, moves.constant[:, :3, 3], strict=True), (len(moves), tip[:3, 3])]
     radius, origin = _STICK * _reach(moves, tip), (0.0, 0.0, 0.0)
-    sticks = [Capsule("", body, origin, tuple(end.tolist()), radius) for body, end in enumerate(ends)]
+    sticks = [Capsule("", body, origin, tuple(end.tolist()), radius) for body, end in ends]
     return _of_capsules(len(ends), sticks)
 
 

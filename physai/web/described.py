@@ -4,10 +4,11 @@ import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 from urdf_parser_py.urdf import Joint, Robot
 
 from physai.errors import UserError
-from physai.robots.chain import motions
+from physai.robots.chain import carried, motions
 from physai.robots.urdf import load
 from physai.robots.visuals import visual_bodies
 from physai.web.appearance import Appearance
@@ -29,7 +30,7 @@ class Described:
 
     @classmethod
     def read(cls, text: str) -> "Described":
-        """Read a URDF: the longest arm in it, with what hangs on it held at zero.
+        """Read a URDF: an arm, or legs; all of its joints that turn are driven, and the others held at zero.
 
         Raises:
             UserError: If it is none, or has no joint that turns.
@@ -38,24 +39,33 @@ class Described:
             path = Path(folder) / "robot.urdf"
             path.write_text(text)
             robot = load(path)
-            chain = _longest(robot)
-            joints = tuple(joint.name for joint in chain if joint.type in _TURNING)
+            base, order = _from_base(robot)
+            joints = tuple(joint.name for joint in order if joint.type in _TURNING)
             if not joints:
                 raise UserError("the robot's description has no joint that turns")
-            meshes = visual_bodies(path, chain[0].parent, joints)
-        moves, tip = motions(chain, joints)
-        return cls(joints, Appearance.of_shapes(moves, meshes, tip))
+            meshes = visual_bodies(path, base, joints)
+        moves = motions(order, base, joints)
+        return cls(joints, Appearance.of_shapes(moves, meshes, _tip(order, base, joints, moves.carriers)))
 
 
-def _longest(robot: Robot) -> list[Joint]:
-    """Of the ways from the root to an end, that with the most joints that turn."""
-    above = {joint.child: joint for joint in robot.joints}
-    best: list[Joint] = []
-    for link in robot.links:
-        chain: list[Joint] = []
-        end = link.name
-        while end in above and len(chain) <= len(above):
-            chain.insert(0, above[end])
-            end = chain[0].parent
-        best = max(best, chain, key=lambda found: (sum(joint.type in _TURNING for joint in found), len(found)))
-    return best
+def _from_base(robot: Robot) -> tuple[str, list[Joint]]:
+    """The link that nothing carries, and all joints, those that carry others before them."""
+    carried_links = {joint.child for joint in robot.joints}
+    bases = [link.name for link in robot.links if link.name not in carried_links]
+    if len(bases) != 1:
+        raise UserError(f"the robot's description has {len(bases)} links that nothing carries, not one")
+    order: list[Joint] = []
+    reached = bases.copy()
+    for link in reached:  # grows while it is walked
+        below = [joint for joint in robot.joints if joint.parent == link and joint.child not in reached]
+        order += below
+        reached += [joint.child for joint in below]
+    return bases[0], order
+
+
+def _tip(order: list[Joint], base: str, joints: tuple[str, ...], carriers: tuple[int, ...]) -> np.ndarray | None:
+    """The frame of the last link in that of the last body, 4 x 4; None where there are several limbs."""
+    if carriers != tuple(range(len(joints))):
+        return None
+    where = carried(order, base, joints)
+    return next(frame for joint in reversed(order) for body, frame in [where[joint.child]] if body == len(joints))

@@ -16,7 +16,7 @@ _PAUSE = 0.5  # s, between having settled at a goal and the next one
 
 
 class DrivenRobot:
-    """One robot, without episodes: it goes from goal to goal and starts anew only after a collision.
+    """One robot, without episodes: it goes from goal to goal and starts anew only after a collision or a fall.
 
     Args:
         actor: Writes ``action``.
@@ -27,7 +27,7 @@ class DrivenRobot:
         goals: How many goals there have been; a goal counts from when it rests.
         reached: How many of them were a success, as the task judges it.
         settled: At how many of them the robot stayed.
-        crashed: How often it touched itself or what stands around.
+        crashed: How often it touched itself or what stands around, or fell.
 
     Raises:
         UserError: If the robot is not a simulated one.
@@ -39,7 +39,9 @@ class DrivenRobot:
             env.close()
             raise UserError(f"physics: the robot of '{self.simulation.config.name}' is not simulated")
         self._actor, self._env = actor, env
-        dt = self.simulation.config.control_dt
+        task, dt = self.simulation.task, self.simulation.config.control_dt
+        self._most_steps = task.goal_steps or task.max_steps
+        task.goal_steps = 0  # goals come from whoever looks, and stay until they ask for another one
         self._settled_steps, self._pause_steps = math.ceil(SETTLED / dt - 1e-9), math.ceil(_PAUSE / dt)
         self.goals = self.reached = self.settled = self.crashed = 0
         self._steps, self._counts, self._was_reached, self._was_settled = 0, True, False, False
@@ -50,6 +52,12 @@ class DrivenRobot:
     def joint_position(self) -> np.ndarray:
         """Where the joints are, rad, [n]."""
         return self.simulation.state.joint_position[0]
+
+    @property
+    def base_pose(self) -> np.ndarray | None:
+        """Where a base that floats is: x, y, z, m, and a quaternion x, y, z, w, [7]; None of a fixed one."""
+        pose = self.simulation.state.base_pose
+        return None if pose is None else pose[0]
 
     @property
     def goal(self) -> np.ndarray:
@@ -65,7 +73,7 @@ class DrivenRobot:
     def finished(self) -> bool:
         """Whether it is time for another goal: it has stayed at this one, or had as long as an episode is."""
         stayed = self.simulation.within[0] >= self._settled_steps + self._pause_steps
-        return bool(stayed) or self._steps >= self.simulation.task.max_steps
+        return bool(stayed) or self._steps >= self._most_steps
 
     def step(self) -> None:
         """Go on by one control step."""
@@ -83,10 +91,12 @@ class DrivenRobot:
             self.restart()
 
     def restart(self) -> None:
-        """Begin anew somewhere, with another goal and a robot that is as this one."""
-        parameters = self.simulation.physics_parameters
+        """Begin anew somewhere, with another goal, if that is a place, and a robot that is as this one."""
+        parameters, goal = self.simulation.physics_parameters, self.simulation.goal
         self._tensordict = self._env.reset()
         self.simulation.change(parameters)
+        if self.simulation.task.goal.quantity is Quantity.TWIST:  # who told it to walk has not told it to stop
+            self.simulation.aim(goal)
         self._begin_goal()
 
     def clear(self) -> None:

@@ -1,4 +1,4 @@
-"""The page of ``python -m physai.play render=web``: a policy that follows a goal which people drag."""
+"""The page of ``python -m physai.play render=web``: a policy that follows what people drag, or ask for by sliders."""
 
 import contextlib
 import queue
@@ -16,12 +16,13 @@ from physai.config import validate
 from physai.errors import UserError
 from physai.physics import RandomizationConfig
 from physai.physics.randomization import Uniform
+from physai.signals import Quantity
 from physai.targets import find
 from physai.web.appearance import Appearance
 from physai.web.driven import DrivenRobot
 from physai.web.goal import GoalMarker
-from physai.web.scene import RobotScene
-from physai.web.server import serve
+from physai.web.scene import RobotScene, on_the_spot
+from physai.web.server import CELL, Server, serve
 
 _FRAMES = 30.0  # pictures a second; browsers blend nothing, and more would not be seen
 _WORDS = 5.0  # updates of what is written, a second
@@ -60,8 +61,11 @@ class LivePage:
         robot: That of the first policy; it is closed with the page, as are those that are chosen later.
     """
 
-    def __init__(self, server: viser.ViserServer, choices: Choices, robot: DrivenRobot) -> None:
+    def __init__(self, server: Server, choices: Choices, robot: DrivenRobot) -> None:
         self._server, self._choices, self._robot = server, choices, robot
+        self._floor = server.floor.position
+        self._numbers: dict[int, viser.GuiSliderHandle[float]] = {}
+        self._told = np.zeros(0)  # the goal that they show
         self._asked: queue.SimpleQueue[Callable[[], Any]] = queue.SimpleQueue()
         self._paused, self._dragging = False, False
         gui = server.gui
@@ -75,8 +79,9 @@ class LivePage:
         gui.add_button("Step", icon=viser.Icon.PLAYER_TRACK_NEXT).on_click(self._when(self._one_step))
         gui.add_button("Reset", icon=viser.Icon.RELOAD).on_click(self._when(self._reset))
         gui.add_button("Another goal", icon=viser.Icon.TARGET).on_click(self._when(self._draw_goal))
-        self._by_itself = gui.add_checkbox("Goals by themselves", False, hint="Dragging the goal turns this off.")
+        self._by_itself = gui.add_checkbox("Goals by themselves", False, hint="Who asks for one turns this off.")
         self._speed = gui.add_slider("Speed, times real time", 0.1, 4.0, 0.1, 1.0)
+        self._wanted = gui.add_folder("Asked for", visible=False)
         with gui.add_folder("The robot"):
             self._sliders = self._add_sliders()
         self._show_robot()
@@ -134,8 +139,42 @@ class LivePage:
         )
         for name, slider in self._sliders.items():
             _set(slider, float(robot.parameters[simulation.layout.columns[name]][0]))
+        self._add_numbers()
         self._draw()
         self._words.content = self._describe()
+
+    def _add_numbers(self) -> None:
+        """A slider for each number of a goal that is no place, and so cannot be dragged."""
+        for slider in self._numbers.values():
+            slider.remove()
+        self._numbers.clear()
+        self._told = np.zeros(0)
+        goal = self._robot.simulation.task.goal
+        self._wanted.visible = not self._marker.drawable and bool(np.isfinite(goal.bounds).all())
+        if not self._wanted.visible:
+            return
+        with self._wanted:
+            for number, (label, low, high) in enumerate(zip(goal.labels, *goal.bounds, strict=True)):
+                if low < high:
+                    step, name = (high - low) / 100, label.replace("_", " ")
+                    slider = self._server.gui.add_slider(name, low, high, step, np.clip(0.0, low, high).item())
+                    slider.on_update(self._asking(number))
+                    self._numbers[number] = slider
+
+    def _asking(self, number: int) -> Callable[[viser.GuiEvent], None]:
+        def ask(event: viser.GuiEvent) -> None:
+            if event.client is not None:
+                value = float(event.target.value)  # as it is now: the next one may already be on its way
+                self._asked.put(lambda: self._ask_for(number, value))
+
+        return ask
+
+    def _ask_for(self, number: int, value: float) -> None:
+        if number in self._numbers:
+            goal = self._robot.goal.copy()
+            goal[number] = value
+            self._told = goal  # and is not told again, unless another one is taken
+            self._aim(goal, True)
 
     def _choose(self, engine: str | None) -> None:
         """Take another policy, or another engine; what cannot be loaded changes nothing, and says why."""
@@ -189,16 +228,31 @@ class LivePage:
 
     def _draw(self) -> None:
         self._scene.show(self._robot.joint_position)
+        if (pose := self._robot.base_pose) is not None:  # it walks on the spot, and the floor moves below it
+            self._scene.move_base(on_the_spot(pose))
+            self._server.floor.position = (*(-np.fmod(pose[:2], CELL)), self._floor[2])
         if not self._dragging:  # else the browser knows better where it is
             self._marker.show(self._robot.goal)
+        if not np.array_equal(self._robot.goal, self._told):  # else the sliders know better
+            self._told = self._robot.goal.copy()
+            for number, slider in self._numbers.items():
+                _set(slider, round(float(self._told[number]), 3))
 
     def _describe(self) -> str:
         robot = self._robot
         task, error = robot.simulation.task, robot.simulation.error[0]
+        walks = task.goal.quantity is Quantity.TWIST
         lines = [
-            f"{tolerance.name.replace('_', ' ').capitalize()} to the goal: **{value:.3f} {tolerance.unit}**"
+            f"{tolerance.name.replace('_', ' ').capitalize()} {'off by' if walks else 'to the goal'}: "
+            f"**{value:.3f} {tolerance.unit}**"
             for tolerance, value in zip(task.tolerances, error, strict=True)
         ]
+        if (twist := robot.simulation.state.base_twist) is not None:
+            lines.insert(
+                0, f"It walks at **{np.hypot(*twist[0, :2]):.2f} m/s**, and turns at **{twist[0, 5]:.2f} rad/s**"
+            )
+        if walks:
+            return "  \n".join([*lines, f"Falls: **{robot.crashed}**"])
         lines.append(f"Goals: **{robot.goals}**, reached: **{robot.reached}**, settled: **{robot.settled}**")
         if robot.crashed:
             lines.append(f"Collisions: **{robot.crashed}**")

@@ -6,6 +6,13 @@ from scipy.spatial.transform import Rotation
 
 from physai.web.appearance import Appearance
 
+_NO_UNIT = 0.1  # by which the length of a quaternion may be off
+
+
+def on_the_spot(pose: np.ndarray) -> np.ndarray:
+    """Return a pose [7] of a robot that walks, m and quaternion, without the way that it has gone."""
+    return np.array([0.0, 0.0, *pose[2:]])
+
 
 class RobotScene:
     """Draws one robot; several may stand in one scene.
@@ -17,7 +24,7 @@ class RobotScene:
         position: Where its base stands, m.
 
     Attributes:
-        root: Name of the node in the frame of the robot's base; what is added below stands and goes with it.
+        root: Name of the node where it stands, the frame of a fixed base; what is added below goes with it.
     """
 
     def __init__(
@@ -30,9 +37,10 @@ class RobotScene:
         self.appearance = appearance
         self.root = f"/{name}"
         self._server = server
-        self._base = server.scene.add_frame(self.root, show_axes=False, position=position)
+        self._stand = server.scene.add_frame(self.root, show_axes=False, position=position)
+        self._base = server.scene.add_frame(f"{self.root}/base", show_axes=False)
         self._bodies = [
-            None if gltf is None else server.scene.add_glb(f"{self.root}/body{number}", gltf)
+            None if gltf is None else server.scene.add_glb(f"{self.root}/base/body{number}", gltf)
             for number, gltf in enumerate(appearance.bodies)
         ]
         self._shown = np.full(appearance.joints, np.nan)
@@ -57,10 +65,21 @@ class RobotScene:
                 if body is not None:
                     body.position, body.wxyz = frame[:, 3], turn
 
+    def move_base(self, pose: np.ndarray) -> None:
+        """Show a base that floats at x, y, z, m, and a quaternion x, y, z, w, [7], from where the robot stands."""
+        if np.isfinite(pose).all():
+            with self._server.atomic():
+                self._base.position, self._base.wxyz = pose[:3], np.roll(pose[3:], 1)
+
+    def turn_base(self, turn: np.ndarray) -> None:
+        """Show a base that floats turned by a quaternion x, y, z, w, [4]; what is none leaves it as it is."""
+        if abs(np.linalg.norm(turn) - 1.0) < _NO_UNIT:  # and of numbers that are not finite, nothing is near
+            self._base.wxyz = np.roll(turn, 1)
+
     def place(self, position: tuple[float, float, float]) -> None:
-        """Put its base elsewhere, m."""
-        self._base.position = position
+        """Have it stand elsewhere, m."""
+        self._stand.position = position
 
     def remove(self) -> None:
         """Take it out of the scene, with all that was added below its root."""
-        self._base.remove()
+        self._stand.remove()

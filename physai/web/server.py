@@ -12,6 +12,8 @@ from physai.web.door import Door, guarding
 
 Point = tuple[float, float, float]
 
+CELL = 0.1  # m, of the grid on the floor
+
 
 def camera(reach: float) -> tuple[Point, Point]:
     """Where the camera is that sees a robot, and where it looks, m.
@@ -22,7 +24,11 @@ def camera(reach: float) -> tuple[Point, Point]:
     return (1.0 * reach, -1.5 * reach, 1.4 * reach), (0.0, 0.0, 0.25 * reach)
 
 
-class _Server(viser.ViserServer):
+class Server(viser.ViserServer):
+    """A server whose scene has a floor."""
+
+    floor: viser.GridHandle
+
     def request_share_url(self, verbose: bool = True) -> None:
         """Refuse what any client can ask viser for: a tunnel that shows the page to the internet."""
 
@@ -30,7 +36,7 @@ class _Server(viser.ViserServer):
 @contextlib.contextmanager
 def serve(
     host: str, port: int, label: str, reach: float, floor: float = 0.0, door: Door | None = None
-) -> Iterator[viser.ViserServer]:
+) -> Iterator[Server]:
     """Context with a server, whose scene has a floor, and a camera for robots of a size.
 
     Args:
@@ -54,9 +60,10 @@ def serve(
         port = probe.getsockname()[1]
     keeper = guarding(door or Door(host, commands=True))
     with contextlib.redirect_stdout(io.StringIO()), keeper:  # it prints its address in a frame
-        server = _Server(host=host, port=port, label=label, verbose=False)
+        server = Server(host=host, port=port, label=label, verbose=False)
     server.gui.configure_theme(control_layout="fixed", show_logo=False, show_share_button=False)
-    server.scene.add_grid("/floor", width=4 * reach, height=4 * reach, position=(0.0, 0.0, floor), cell_size=0.1)
+    size, place = 4 * reach, (0.0, 0.0, floor)
+    server.floor = server.scene.add_grid("/floor", width=size, height=size, position=place, cell_size=CELL)
     server.initial_camera.position, server.initial_camera.look_at = camera(reach)
     try:
         yield server

@@ -19,7 +19,7 @@ from physai.processes import follow
 from physai.training.evaluation import WATCHED, Recording
 from physai.web.appearance import Appearance
 from physai.web.goal import GoalMarker
-from physai.web.scene import RobotScene
+from physai.web.scene import RobotScene, on_the_spot
 from physai.web.server import serve
 
 _COLUMNS = 4
@@ -125,16 +125,19 @@ class _Page:
             if step > last + _HOLD / self._dt:
                 began, step = time.monotonic(), 0
             if self._server.get_clients():
-                self._show(recording.joint_position[min(step, last)])
+                self._show(recording, min(step, last))
 
     def _begin(self, frames: int, recording: Recording) -> None:
         for marker, goal in zip(self._goals, recording.goal, strict=False):
             marker.show(goal)
         successes = f"{recording.success.sum()} of these {len(recording.success)} episodes succeed."
         self._words.content = f"After **{frames:,}** frames: **{successes}**"
-        self._show(recording.joint_position[0])
+        self._show(recording, 0)
 
-    def _show(self, joint_position: np.ndarray) -> None:
+    def _show(self, recording: Recording, step: int) -> None:
         with self._server.atomic():
-            for robot, position in zip(self._robots, joint_position, strict=False):
+            for robot, position in zip(self._robots, recording.joint_position[step], strict=False):
                 robot.show(position)
+            if recording.base_pose is not None:
+                for robot, pose in zip(self._robots, recording.base_pose[step], strict=False):
+                    robot.move_base(on_the_spot(pose))

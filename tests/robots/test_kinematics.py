@@ -56,7 +56,7 @@ def reference(spec: RobotSpec, joint_position: np.ndarray) -> np.ndarray:
     """The textbook product of homogeneous matrices in float64, [3]."""
     angles = dict(zip(spec.joints, joint_position, strict=True))
     pose = np.eye(4)
-    for joint in spec.chain:
+    for joint in spec.linkage:
         if joint.origin is not None:
             before = np.eye(4)
             before[:3, :3] = Rotation.from_euler("xyz", joint.origin.rpy).as_matrix()
@@ -195,7 +195,7 @@ def test_reach_bounds_the_distance_from_the_first_joint_and_is_attained_by_the_p
     for config in (reacher, kuka_reacher):
         spec = RobotSpec.from_config(config.robot)
         kinematics = ForwardKinematics(spec)
-        shoulder = torch.tensor(spec.chain[0].origin.xyz, dtype=torch.float32)
+        shoulder = torch.tensor(spec.linkage[0].origin.xyz, dtype=torch.float32)
         distance = torch.linalg.vector_norm(kinematics(random_positions(1000, 2)) - shoulder, dim=-1)
         assert distance.max() <= kinematics.reach + 1e-6
     planar = ForwardKinematics(RobotSpec.from_config(reacher.robot))

@@ -2,11 +2,16 @@
 
 import numpy as np
 import pytest
+from omegaconf import DictConfig
 from scipy.spatial.transform import Rotation
 from urdf_parser_py.urdf import Robot
 
+from physai.config import validate
 from physai.deploy import load_policy
+from physai.envs.simulation import EnvConfig
+from physai.robots import RobotSpec
 from physai.ros.topics.description import LinkFrames, urdf
+from physai.web.described import Described
 
 
 def place(frames: LinkFrames, positions: dict[str, float], link: str) -> np.ndarray:
@@ -41,6 +46,27 @@ def test_another_parser_reads_it(run, request):
     assert [joint.name for joint in robot.joints if joint.type == "revolute"] == list(metadata.joints)
     assert robot.get_root() == "world"
     assert sum(len(link.visuals) for link in robot.links) > len(metadata.joints)
+
+
+def test_legs_stand_on_the_floor_and_their_feet_are_where_the_robot_has_them(walking_policy):
+    metadata = walking_policy.metadata
+    env = validate(EnvConfig, DictConfig(metadata.raw["config"]["env"]))
+    spec = RobotSpec.from_config(env.robot)
+    text = urdf(metadata, "")
+    frames, robot = LinkFrames(text), Robot.from_xml_string(text)
+    assert (frames.joints, robot.get_root()) == (list(metadata.joints), "world")
+    at_home = dict(zip(metadata.joints, spec.home, strict=True))
+    feet = [link.name for link in robot.links if link.name.startswith("foot")]
+    assert len(feet) == 4
+    heights = [place(frames, at_home, foot)[2, 3] for foot in feet]
+    assert heights == pytest.approx([0.02] * 4, abs=0.02)  # a foot is a ball of 2 cm
+    described = Described.read(text)
+    assert set(described.joints) == set(metadata.joints)
+    position = np.random.default_rng(0).uniform(-0.5, 0.5, 12)
+    by_name = dict(zip(metadata.joints, position, strict=True))
+    drawn = described.appearance.frames(np.array([by_name[joint] for joint in described.joints]))
+    for joint, frame in zip(described.joints, drawn[1:], strict=True):
+        assert frame == pytest.approx(place(frames, by_name, f"{joint}_body")[:3], abs=1e-6)
 
 
 def test_it_may_come_from_anybody():

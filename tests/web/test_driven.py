@@ -1,9 +1,12 @@
 """A robot that goes from goal to goal, with parameters that change on its way."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from physai.artifact.acting import PolicyFile
+from physai.physics import RandomizationConfig
 from physai.web.driven import DrivenRobot
 from physai.web.live import sensed
 
@@ -64,3 +67,35 @@ def test_noise_that_is_set_reaches_what_the_policy_sees(robot):
     drive(robot, 2)
     seen, true = robot._tensordict["joint_position"][0].numpy(), robot.joint_position
     assert np.abs(seen - true).max() > 1e-3
+
+
+@pytest.fixture
+def walker(walking_run):
+    file = PolicyFile(walking_run / "policy.pt")
+    robot = DrivenRobot(*file.deploy(1, 0, sensed(RandomizationConfig.none())))
+    yield robot
+    robot.close()
+
+
+def test_a_robot_on_legs_follows_one_command_until_there_is_another(walker):
+    walker.aim(np.array([0.5, 0.0, 0.3]), True)
+    drive(walker, 400)  # other commands would have come after 5 s, and an episode would soon be over
+    assert walker.goal == pytest.approx([0.5, 0.0, 0.3])
+    start = walker.base_pose[:2].copy()
+    drive(walker, 100)
+    assert np.linalg.norm(walker.base_pose[:2] - start) > 0.6
+    assert walker.crashed == 0
+    walker.draw_goal()
+    assert walker.goal != pytest.approx([0.5, 0.0, 0.3])
+
+
+def test_a_robot_that_has_fallen_stands_up_and_follows_the_command_that_it_had(walker):
+    walker.aim(np.array([0.5, 0.0, 0.3]), True)
+    drive(walker, 5)
+    simulation = walker.simulation
+    over = replace(simulation.state, base_pose=np.array([[0.0, 0.0, 0.3, 1.0, 0.0, 0.0, 0.0]]))  # on its back
+    simulation.physics.reset(np.arange(1), over)
+    drive(walker, 1)
+    assert walker.crashed == 1
+    assert walker.base_pose[3:] == pytest.approx([0.0, 0.0, 0.0, 1.0], abs=0.1)
+    assert walker.goal == pytest.approx([0.5, 0.0, 0.3])

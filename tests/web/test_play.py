@@ -141,3 +141,35 @@ def test_an_arm_follows_the_goal_that_the_mouse_drags_and_stands_still_when_paus
     wait_until(lambda: np.abs(goal_of(page, seen) - [x, there]).max() > 0.1)
     still = np.median(upper_arm(picture(page), seen), axis=0)
     assert still == pytest.approx(np.median(upper_arm(paused, seen), axis=0), abs=3.0)
+
+
+@pytest.fixture
+def walk_page(browser, serving, walking_run, tmp_path):
+    shutil.copy(walking_run / "policy.pt", tmp_path)
+    with serving("play", "run=policy.pt", "randomization=none") as address:
+        page = browser.new_page(viewport=SIZE)
+        page.goto(address)
+        page.get_by_text("Asked for").wait_for()
+        yield page
+        page.close()
+
+
+@pytest.mark.slow
+def test_legs_walk_on_the_spot_as_the_sliders_ask(walk_page):
+    """Half a minute, for its meshes: nothing else shows that sliders reach a robot, and that legs are drawn."""
+    before = picture(walk_page)
+    assert (before.max(axis=2) < 90).sum() > 1000  # the trunk is black
+    time.sleep(0.5)
+    assert np.abs(picture(walk_page) - before).max() > 40  # its legs, and the floor below them
+
+    ahead, turn = walk_page.locator("input.mantine-NumberInput-input").all()[1:3]  # the first is that of speed
+    for value, low, high in (("0.8", 0.6, 1.1), ("0", 0.0, 0.15)):
+        for number, text in ((ahead, value), (turn, "0")):
+            number.fill(text)
+            number.press("Enter")
+        wait_until(lambda low=low, high=high: low <= speed(walk_page) <= high)
+    assert walk_page.get_by_text("Falls: 0").is_visible()
+
+
+def speed(page):
+    return float(re.search(r"walks at ([\d.]+) m/s", page.get_by_text("It walks at").inner_text())[1])

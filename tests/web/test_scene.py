@@ -1,11 +1,13 @@
 """What a robot looks like, and a goal that is dragged: without a browser."""
 
 import asyncio
+import io
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
+import trimesh
 
 from physai.deploy import read_metadata
 from physai.envs.simulation import Simulation
@@ -13,6 +15,7 @@ from physai.errors import UserError
 from physai.robots import ForwardKinematics, RobotSpec
 from physai.web import Appearance, GoalMarker, RobotScene, serve
 from physai.web.appearance import robot_of
+from physai.web.scene import on_the_spot
 
 
 def test_any_arm_has_something_to_show_of_each_body_that_moves_and_its_tip_is_where_kinematics_say(any_arm):
@@ -23,6 +26,33 @@ def test_any_arm_has_something_to_show_of_each_body_that_moves_and_its_tip_is_wh
     position = spec.sample(1, np.random.default_rng(0))
     expected = ForwardKinematics(spec)(torch.from_numpy(position).float())[0].numpy()
     assert look.tip_position(position[0]) == pytest.approx(expected, abs=1e-5)
+
+
+def test_any_legs_have_something_to_show_and_stand_on_the_floor_at_home(any_legged):
+    spec = RobotSpec.from_config(any_legged.robot)
+    look = Appearance.of_robot(spec)
+    assert all(body is not None and body[:4] == b"glTF" for body in look.bodies)
+    assert look.tip_position(spec.home) is None
+    frames, lowest = look.frames(spec.home), np.inf
+    for body, frame in zip(look.bodies, frames, strict=True):
+        points = trimesh.load_scene(io.BytesIO(body), file_type="glb").to_mesh().vertices
+        lowest = min(lowest, float((points @ frame[2, :3] + frame[2, 3]).min()))
+    assert lowest + spec.floating.height == pytest.approx(look.floor, abs=0.02)
+
+
+def test_a_base_that_floats_is_drawn_where_it_is_and_walks_on_the_spot(env_config):
+    look = Appearance.of_robot(RobotSpec.from_config(env_config("a1_walk").robot))
+    with serve("127.0.0.1", 0, "a1", look.reach) as server:
+        robot = RobotScene(server, "robot", look, (1.0, 2.0, 0.0))
+        robot.move_base(on_the_spot(np.array([5.0, 6.0, 0.3, 0.0, 0.0, 1.0, 0.0])))
+        assert robot._base.position == pytest.approx([0.0, 0.0, 0.3])
+        assert robot._base.wxyz == pytest.approx([0.0, 0.0, 0.0, 1.0])
+        for bad in ([0.0, 0.0, 0.0, 0.0], [np.nan, 0.0, 0.0, 1.0], [2.0, 0.0, 0.0, 0.0]):
+            robot.turn_base(np.array(bad))
+            robot.move_base(np.array([np.inf, 0.0, 0.3, *bad]))
+        assert robot._base.wxyz == pytest.approx([0.0, 0.0, 0.0, 1.0])
+        robot.turn_base(np.array([0.0, 1.0, 0.0, 0.0]))
+        assert robot._base.wxyz == pytest.approx([0.0, 0.0, 1.0, 0.0])
 
 
 def test_a_policy_file_is_drawn_by_its_urdf_or_says_why_it_cannot_be(exported_run, monkeypatch):

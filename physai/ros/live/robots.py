@@ -12,7 +12,7 @@ import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.node import Node, NodeNameNonExistentError
 from rclpy.publisher import Publisher
-from sensor_msgs.msg import JointState
+from sensor_msgs.msg import Imu, JointState
 from std_msgs.msg import Bool, String
 from std_srvs.srv import SetBool, Trigger
 
@@ -20,7 +20,7 @@ from physai.deploy import PolicyError
 from physai.deploy.metadata import read_goal
 from physai.errors import UserError
 from physai.ros.live.status import Status
-from physai.ros.topics import goals, joint_states, qos
+from physai.ros.topics import goals, imu, joint_states, qos
 from physai.ros.topics.emergency_stop import ALL
 from physai.signals import Quantity
 
@@ -133,7 +133,9 @@ class _Link:
         self._name = f"{namespace}/{_NODE}"
         self._count = 0
         self._joints: Any = None
+        self._imu: Any = None
         self._goal: Any = None
+        self._walks = False
         self._goals: Publisher | None = None
         self._waiting: list[tuple[float, Any, Any]] = []  # since when, client, future
         topics: dict[str, Callable[[Any], None]] = {
@@ -160,11 +162,13 @@ class _Link:
         if present != status.present:
             status.present, status.since = present, now
             if not present:  # another one may come, with other joint states
-                self._destroy_joints()
+                self._destroy_sensors()
         status.rate = self._count / elapsed if elapsed > 0 else 0.0
         self._count = 0
-        if present and self._joints is None and (topic := self._joint_topic()):
+        if present and self._joints is None and (topic := self._heard("JointState", joint_states.TOPIC)):
             self._joints = self._node.create_subscription(JointState, topic, self._take_joints, qos.SENSOR)
+        if present and self._walks and self._imu is None and (topic := self._heard("Imu", imu.TOPIC)):
+            self._imu = self._node.create_subscription(Imu, topic, self._take_imu, qos.SENSOR)
         for since, client, future in self._waiting[:]:
             if now - since > _ANSWER and not future.done():
                 client.remove_pending_request(future)
@@ -172,15 +176,15 @@ class _Link:
             if now - since > _ANSWER or future.done():
                 self._waiting.remove((since, client, future))
 
-    def _joint_topic(self) -> str | None:
-        """Where its joint states come from, which may have been remapped; None while that is not known."""
+    def _heard(self, kind: str, name: str) -> str | None:
+        """Where it hears a kind of sensor_msgs, which may have been remapped; None while that is not known."""
         try:
             heard = self._node.get_subscriber_names_and_types_by_node(_NODE, self.status.namespace or "/")
         except NodeNameNonExistentError:
             return None
-        topics = [topic for topic, kinds in heard if "sensor_msgs/msg/JointState" in kinds]
+        topics = [topic for topic, kinds in heard if f"sensor_msgs/msg/{kind}" in kinds]
         others = [topic for topic in topics if topic != f"{self._name}/goal"]
-        own = f"{self.status.namespace}/{joint_states.TOPIC}"
+        own = f"{self.status.namespace}/{name}"
         return own if own in others else next(iter(others), None)
 
     def _take_state(self, message: String) -> None:
@@ -193,8 +197,8 @@ class _Link:
         self.status.goal_description = message.data
         try:
             self._goal, _, _ = read_goal(message.data)
-            kind = goals.goal_type(self._goal)
-            if self._goal.quantity is Quantity.TWIST:
+            kind, self._walks = goals.goal_type(self._goal), self._goal.quantity is Quantity.TWIST
+            if self._walks:
                 raise UserError("it follows velocities, which this page does not send")
         except (PolicyError, UserError) as error:
             self._goal = None
@@ -211,6 +215,10 @@ class _Link:
             told = dict(zip(message.name, message.position, strict=True))
             self.status.joint_position = {**self.status.joint_position, **told}
             self.status.moved = time.monotonic()
+
+    def _take_imu(self, message: Imu) -> None:
+        turn = message.orientation
+        self.status.turn = np.array([turn.x, turn.y, turn.z, turn.w])
 
     def say(self, words: str) -> None:
         """Tell what became of what was asked."""
@@ -253,15 +261,16 @@ class _Link:
         if (answer := future.result()) is not None:
             self.say(f"{service}: {'' if answer.success else 'REFUSED: '}{answer.message}")
 
-    def _destroy_joints(self) -> None:
-        if self._joints is not None:
-            self._node.destroy_subscription(self._joints)
-        self._joints = None
-        self.status.joint_position, self.status.moved = {}, -math.inf
+    def _destroy_sensors(self) -> None:
+        for subscription in (self._joints, self._imu):
+            if subscription is not None:
+                self._node.destroy_subscription(subscription)
+        self._joints = self._imu = None
+        self.status.joint_position, self.status.moved, self.status.turn = {}, -math.inf, None
 
     def close(self) -> None:
         """Listen no more."""
-        self._destroy_joints()
+        self._destroy_sensors()
         for subscription in self._made:
             self._node.destroy_subscription(subscription)
         for client in self._clients.values():

@@ -42,6 +42,7 @@ class Status:
         joint_position: rad, by name.
         moved: When these came.
         rate: How often they come, Hz.
+        turn: Of the base of a robot on legs, as its IMU says, a quaternion x, y, z, w; None while it has said nothing.
         description: Its URDF; empty while it has told none.
         goal_description: What its goals are, JSON; the same.
         said: What became of the last thing that it was asked.
@@ -59,6 +60,7 @@ class Status:
     joint_position: Mapping[str, float] = field(default_factory=dict)
     moved: float = -math.inf
     rate: float = 0.0
+    turn: np.ndarray | None = None
     description: str = ""
     goal_description: str = ""
     said: str = ""

@@ -17,9 +17,10 @@ _COLOR = "0.95 0.45 0.12 1"
 
 
 def urdf(metadata: Metadata, prefix: str) -> str | None:
-    """Describe the arm of a policy; tools that know URDFs and joint states can draw it.
+    """Describe the robot of a policy; tools that know URDFs and joint states can draw it.
 
-    Links look like the capsules of the policy file, or like sticks from joint to joint where it has none.
+    Links look like the capsules of the policy file, or like sticks from joint to joint where it has none. Legs stand on
+    the floor as they do at home.
 
     Args:
         metadata: Of the policy.
@@ -30,22 +31,29 @@ def urdf(metadata: Metadata, prefix: str) -> str | None:
     """
     if metadata.kinematics is None:
         return None
-    motions, tip = metadata.kinematics
+    motions, ends = metadata.kinematics.motions, metadata.kinematics.ends
     places = motions.constant + motions.cosine  # of joints at zero, in the frame before
     bodies = [prefix + name for name in (metadata.goal.frame or "base", *(f"{j}_body" for j in metadata.joints))]
     robot = Xml.Element("robot", name=metadata.robot)
     Xml.SubElement(robot, "link", name="world")
-    _add_joint(robot, f"{prefix}stand", "fixed", "world", bodies[0], np.eye(4))
+    stand = np.eye(4)
+    stand[2, 3] = metadata.kinematics.height
+    _add_joint(robot, f"{prefix}stand", "fixed", "world", bodies[0], stand)
     for number, joint in enumerate(metadata.joints):
-        added = _add_joint(robot, joint, "revolute", bodies[number], bodies[number + 1], places[number])
+        added = _add_joint(
+            robot, joint, "revolute", bodies[motions.carriers[number]], bodies[number + 1], places[number]
+        )
         Xml.SubElement(added, "axis", xyz=_numbers(_axis(places[number], motions.sine[number])))
         Xml.SubElement(added, "limit", _limit(metadata, number))
-    for number, (name, end) in enumerate(zip(bodies, [*places, tip], strict=True)):
+    leads_to = [*zip(motions.carriers, places, strict=True), *ends]
+    for number, name in enumerate(bodies):
         link = Xml.SubElement(robot, "link", name=name)
-        for capsule in _shapes(metadata, number, end[:3, 3]):
+        for capsule in _shapes(metadata, number, [end[:3, 3] for body, end in leads_to if body == number]):
             _add_capsule(link, capsule)
-    Xml.SubElement(robot, "link", name=f"{prefix}tip")
-    _add_joint(robot, f"{prefix}to_tip", "fixed", bodies[-1], f"{prefix}tip", tip)
+    for number, (body, end) in enumerate(ends, 1):
+        name = "tip" if len(ends) == 1 else f"foot{number}"
+        Xml.SubElement(robot, "link", name=f"{prefix}{name}")
+        _add_joint(robot, f"{prefix}to_{name}", "fixed", bodies[body], f"{prefix}{name}", end)
     return Xml.tostring(robot, encoding="unicode")
 
 
@@ -62,12 +70,14 @@ def _limit(metadata: Metadata, number: int) -> dict[str, str]:
     return {key: f"{value:g}" for key, value in values.items()}
 
 
-def _shapes(metadata: Metadata, body: int, end: np.ndarray) -> Iterator[Capsule]:
+def _shapes(metadata: Metadata, body: int, ends: Sequence[np.ndarray]) -> Iterator[Capsule]:
     if metadata.collision is not None:
         yield from (capsule for capsule in metadata.collision.capsules if capsule.body == body)
-    elif (length := float(np.linalg.norm(end))) > 0:
-        x, y, z = end.tolist()
-        yield Capsule("stick", body, (0.0, 0.0, 0.0), (x, y, z), max(_THICKNESS * length, _THINNEST))
+        return
+    for end in ends:
+        if (length := float(np.linalg.norm(end))) > 0:
+            x, y, z = end.tolist()
+            yield Capsule("stick", body, (0.0, 0.0, 0.0), (x, y, z), max(_THICKNESS * length, _THINNEST))
 
 
 def _add_joint(robot: Xml.Element, name: str, kind: str, parent: str, child: str, place: np.ndarray) -> Xml.Element:

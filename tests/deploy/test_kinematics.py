@@ -1,0 +1,67 @@
+"""What a policy file tells of its links: read as it was written, and refused by name where it is impossible."""
+
+import copy
+import json
+
+import numpy as np
+import pytest
+
+from physai.artifact.describe import kinematics
+from physai.deploy import PolicyError
+from physai.deploy.kinematics import Kinematics
+from physai.robots import RobotSpec
+
+
+@pytest.mark.parametrize("env", ["reacher", "panda_reach", "a1_walk"])
+def test_it_is_read_as_it_was_written(env_config, env):
+    spec = RobotSpec.from_config(env_config(env).robot)
+    written = kinematics(spec)
+    read = Kinematics.read({"kinematics": json.loads(json.dumps(written.describe()))}, len(spec.joints))
+    position = spec.sample(3, np.random.default_rng(0))
+    np.testing.assert_array_equal(read.motions.frames(position), written.motions.frames(position))
+    assert read.height == written.height
+    for (body, frame), (other_body, other) in zip(read.ends, written.ends, strict=True):
+        assert body == other_body
+        np.testing.assert_array_equal(frame, other)
+
+
+def test_a_file_may_tell_nothing():
+    assert Kinematics.read({}, 2) is None
+
+
+@pytest.fixture(scope="module")
+def legs(env_config):
+    return {"kinematics": kinematics(RobotSpec.from_config(env_config("a1_walk").robot)).describe()}
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "said"),
+    [
+        ("carriers", [0, 1, 2], "kinematics.carriers must have the shape [12], not [3]"),
+        ("carriers", [12] * 12, "carriers must be a body for each joint that comes before it"),
+        ("carriers", [0.5] * 12, "bodies must be numbered from 0 to 12"),
+        ("carriers", [-1] * 12, "bodies must be numbered from 0 to 12"),
+        ("feet", [], "kinematics.feet must be a list of places"),
+        ("feet", [[3, 0.0, 0.0, 0.0]] * 101, "kinematics.feet must be a list of places"),
+        ("feet", [[13, 0.0, 0.0, 0.0]], "bodies must be numbered from 0 to 12"),
+        ("feet", [[3, 0.0, 0.0]], "kinematics.feet must have the shape [1, 4]"),
+        ("feet", [[3, 0.0, None, 0.0]], "kinematics.feet must be finite"),
+        ("height", 0, "kinematics.height must be positive"),
+        ("height", "tall", "kinematics.height must hold numbers"),
+        ("constant", [[1.0]], "kinematics.constant must have the shape [12, 4, 4]"),
+    ],
+)
+def test_what_is_impossible_is_named(legs, key, value, said):
+    raw = copy.deepcopy(legs)
+    raw["kinematics"][key] = value
+    with pytest.raises(PolicyError) as error:
+        Kinematics.read(raw, 12)
+    assert said in str(error.value)
+
+
+@pytest.mark.parametrize("key", ["carriers", "height", "sine"])
+def test_what_is_missing_is_named(legs, key):
+    raw = copy.deepcopy(legs)
+    del raw["kinematics"][key]
+    with pytest.raises(PolicyError, match=f"kinematics.{key} is missing"):
+        Kinematics.read(raw, 12)
