@@ -102,6 +102,36 @@ def test_with_torch_and_numpy_alone_a_policy_loads_and_gives_the_same_commands(r
     assert found["load_s"] < 30
 
 
+WALK = """
+import json, sys
+from importlib.util import find_spec
+from physai.deploy import ControllerConfig, Goal, Imu, JointState, load_policy, make_controller
+policy = load_policy(sys.argv[1])
+about = policy.metadata
+controller, at, told = make_controller(policy, ControllerConfig()), about.home, []
+for tick in range(150):
+    now = 100.0 + 0.02 * tick
+    joints = JointState(about.joints, at, 0.0 * at, now)
+    imu = Imu((0.0, 0.0, 0.0, 1.0), (0.0, 0.0, 0.1), now, about.goal.frame)
+    command = controller.update(now, joints, Goal((0.5, 0.0, 0.0), about.goal.frame), (), imu)
+    if command.value is not None:
+        at = command.value
+        told.append(at.tolist())
+print(json.dumps({"importable": [name for name in json.loads(sys.argv[2]) if find_spec(name)], "told": told,
+                  "state": command.state.value}))
+"""
+
+
+@pytest.mark.slow
+def test_with_torch_and_numpy_alone_legs_are_told_what_they_are_told_here(robot_python, walking_run, tmp_path):
+    arguments = str(walking_run / "policy.pt"), json.dumps(ABSENT)
+    there, here = (json.loads(run(python, WALK, *arguments, cwd=tmp_path)) for python in (robot_python, sys.executable))
+    assert there["importable"] == []
+    assert there["state"] == "active"
+    assert len(there["told"]) > 100
+    assert there["told"] == here["told"]
+
+
 REFUSE = """
 import sys
 from physai.deploy import PolicyError, load_policy, read_metadata
