@@ -5,7 +5,7 @@ import runpy
 import shutil
 import signal
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import redirect_stdout
 from functools import partial
 from pathlib import Path
@@ -28,6 +28,7 @@ from physai.deploy import Policy, load_policy
 from physai.envs.simulation import EnvConfig
 from physai.training.config import TrainConfig
 from physai.training.run import load_config, run_training
+from tests.forge import close_forges
 from tests.training.small import SMALL, TINY, command, run_here
 
 # A shell that starts the tests in the background has them, and whatever they start, take no notice of Ctrl-C.
@@ -79,6 +80,12 @@ def run(tmp_path, monkeypatch, capsys):
         return code, *capsys.readouterr()
 
     return run
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _nothing_is_forged_any_more() -> Iterator[None]:
+    yield
+    close_forges()
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -100,4 +100,4 @@ def test_a_signal_to_a_parallel_sweep_ends_its_jobs(tmp_path, launcher, number):
 
 def start(arguments, cwd):
     """Start a sweep in a process group of its own."""
-    return command("train", *SWEEP, *arguments, cwd=cwd, start_new_session=True)
+    return command("train", *SWEEP, *arguments, cwd=cwd)

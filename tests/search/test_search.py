@@ -111,7 +111,7 @@ def test_a_killed_search_goes_on_redoes_nothing_and_tries_what_it_would_have_tri
     ranges = {"algo.optimizer.lr": "interval(1e-3,1e-2)"}
     arguments = (*(f"{key}={text}" for key, text in ranges.items()), "search.trials=4", "search.jobs=2")
     folder = tmp_path / "search"
-    process = command("search", *OVERRIDES, *arguments, cwd=tmp_path, start_new_session=True)
+    process = command("search", *OVERRIDES, *arguments, cwd=tmp_path)
     wait_until(lambda: summaries(folder) and len(list(folder.glob("[123]/metrics.csv"))), process)
     os.killpg(process.pid, signal.SIGKILL)
     process.wait()

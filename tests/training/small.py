@@ -4,11 +4,8 @@ import contextlib
 import csv
 import json
 import os
-import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 from omegaconf import OmegaConf
 
@@ -18,6 +15,7 @@ from physai.training.agent import Agent
 from physai.training.callbacks import EvaluationCallback
 from physai.training.config import TrainConfig
 from physai.training.run import load_config, make_trainer, run_training
+from tests.forge import Forked, forge_of
 
 SMALL = (
     "total_frames=16384",
@@ -56,17 +54,13 @@ def small_config(*overrides: str) -> TrainConfig:
     return validate(TrainConfig, compose("train", [*SMALL, *overrides]))
 
 
-def command(module: str, *arguments: str, cwd: Path, **options: Any) -> subprocess.Popen[str]:
-    """Start a physai command as a user would, in a process of its own."""
-    return subprocess.Popen(
-        [sys.executable, "-m", f"physai.{module}", *arguments],
-        cwd=cwd,
-        env=os.environ | {"COLUMNS": "200"},
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-        **options,
-    )
+# What every command imports, which takes longer than most of them run.
+_IMPORTED = ("physai.training.run", "physai.cli", "physai.algorithms", "physai.collectors", "physai.physics.pybullet")
+
+
+def command(module: str, *arguments: str, cwd: Path) -> Forked:
+    """Start a physai command as a user would, in a process and a session of its own."""
+    return Forked(forge_of(*_IMPORTED), f"physai.{module}", arguments, cwd, os.environ | {"COLUMNS": "200"})
 
 
 def metrics(run: Path) -> list[dict[str, str]]:

@@ -40,7 +40,7 @@ class Run:
         saved = max((int(path.stem) for path in self.path.glob("checkpoints/0*.pt")), default=0)
         arguments = ["resume=run"] if self.path.is_dir() else begin
         # A process group, as a terminal makes.
-        self.process = command("train", *arguments, cwd=self.folder, start_new_session=True)
+        self.process = command("train", *arguments, cwd=self.folder)
         deadline = time.monotonic() + 120
         while not self._has_learnt(log, before, saved) and self.process.poll() is None:
             assert time.monotonic() < deadline
@@ -104,7 +104,7 @@ def test_a_run_goes_on_from_a_killed_worker_a_signal_to_all_processes_and_a_kill
     ("late", "number", "code"), [(0.0, signal.SIGINT, 130), (0.1, signal.SIGTERM, 143), (0.4, signal.SIGINT, 130)]
 )
 def test_a_signal_while_the_processes_start_ends_them_all(tmp_path, late, number, code):
-    process = command("train", *SIZES, "hydra.run.dir=run", cwd=tmp_path, start_new_session=True)
+    process = command("train", *SIZES, "hydra.run.dir=run", cwd=tmp_path)
     deadline = time.monotonic() + 60
     while not (everybody := descendants(process.pid)) and time.monotonic() < deadline:
         time.sleep(0.001)
