@@ -27,8 +27,7 @@ class Gait(Config):
     ``phase`` at which share of a period each joint begins. ``lift`` is how far it goes in the middle of the swing;
     ``sway`` how far at the beginning of the swing and a quarter of a period later, and the other way half a period
     after each; ``stride`` how far at the end of the stance, and the other way at its beginning, for each m/s, m/s and
-    rad/s of the command, raised to ``stride_power``: feet slip, and velocity grows faster than strides do.
-    ``yaw_correction`` is how far each joint goes for each rad/s of yaw rate that is missing.
+    rad/s of the command. ``yaw_correction`` is how far each joint goes for each rad/s of yaw rate that is missing.
     """
 
     frequency: PositiveFloat
@@ -36,7 +35,6 @@ class Gait(Config):
     lift: list[float]
     sway: list[Annotated[list[float], Field(min_length=2, max_length=2)]]
     stride: list[Vector]
-    stride_power: Annotated[list[PositiveFloat], Field(min_length=3, max_length=3)]
     yaw_correction: list[float]
 
 
@@ -65,14 +63,12 @@ class WalkObservation(ObservationModule):
         self.lift: Tensor
         self.sway: Tensor
         self.stride: Tensor
-        self.stride_power: Tensor
         self.yaw_correction: Tensor
         self.register_buffer("home", torch.from_numpy(spec.home).float())
         self.register_buffer("phase", torch.tensor(gait.phase))
         self.register_buffer("lift", torch.from_numpy(np.array(gait.lift) / spec.command_limit).float())
         self.register_buffer("sway", torch.from_numpy(np.array(gait.sway).T / spec.command_limit).float())
         self.register_buffer("stride", torch.from_numpy(np.array(gait.stride).T / spec.command_limit).float())
-        self.register_buffer("stride_power", torch.tensor(gait.stride_power))
         correction = np.array(gait.yaw_correction) / spec.command_limit
         self.register_buffer("yaw_correction", torch.from_numpy(correction).float())
 
@@ -95,8 +91,7 @@ class WalkObservation(ObservationModule):
         turn = 2.0 * torch.pi * (self.frequency * clock + self.phase)
         sine, cosine = torch.sin(turn), torch.cos(turn)
         moves = (goal.abs().amax(dim=1, keepdim=True) > self.still).to(goal.dtype)
-        stride = (goal.sign() * goal.abs() ** self.stride_power) @ self.stride
-        way = self.lift * torch.relu(sine) + (self.sway[0] + stride) * cosine + self.sway[1] * sine
+        way = self.lift * torch.relu(sine) + self.sway[0] * cosine + self.sway[1] * sine + goal @ self.stride * cosine
         way = way + self.yaw_correction * (goal[:, 2:] - angular_velocity[:, 2:])
         suggested = torch.atanh(torch.clamp(moves * way, -0.95, 0.95))
         now = 2.0 * torch.pi * self.frequency * clock
