@@ -43,9 +43,9 @@ demo: $(VENV)/.installed-ros  ## Let the newest policy drive a virtual robot ove
 	@echo "==> Driving"
 	$(BIN)/python -m physai.ros.demo $(ARGS)
 
-fleet: $(VENV)/.installed-ros  ## Let the newest policies drive eight virtual robots over ROS 2 (ARGS="arms=4")
+fleet: $(VENV)/.installed-ros  ## Let the newest policies drive eight virtual robots over ROS 2, with a page (ARGS="arms=4")
 	@echo "==> Driving a fleet"
-	$(BIN)/python -m physai.ros.fleet $(ARGS)
+	$(BIN)/python -m physai.ros.fleet render=web $(ARGS)
 
 chromium:
 	@command -v chromium > /dev/null || { test "$$(id -u)" = 0 || \

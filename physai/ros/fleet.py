@@ -1,24 +1,31 @@
 """``python -m physai.ros.fleet``: many virtual robots, each with its policy and its watchdog (see ``--help``)."""
 
+import importlib.util
 import os
+import re
 import signal
 import tempfile
+import time
 from contextlib import ExitStack, closing
 from itertools import cycle, islice
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from omegaconf import DictConfig
 from rich.console import Console
 
 from physai import cli
 from physai.compose import compose
-from physai.config import Config, Count, PositiveFloat, Seed, validate
+from physai.config import Config, Count, PageConfig, PositiveFloat, Seed, not_installed, validate
 from physai.deploy import Metadata, State, read_metadata
 from physai.errors import UserError
 from physai.ros.driving.policies import newest_policies, robot_overrides
 
+if TYPE_CHECKING:
+    from physai.ros.driving.forked import ForkedNode
+
 _FOREVER = 1e9  # s
+_PATIENCE = 60.0  # s, for the dashboard to start
 _PER_CORE = 1.5  # arms, with their nodes
 _MOST = 9  # arms: more processes than that do not find each other on one computer's loopback
 
@@ -33,6 +40,8 @@ class FleetConfig(Config):
     seconds: PositiveFloat | None
     randomization: dict[str, Any]
     seed: Seed
+    render: Literal["web"] | None
+    web: PageConfig
 
     @property
     def robot(self) -> str:
@@ -65,6 +74,8 @@ def _check(node: DictConfig) -> None:
     config = validate(FleetConfig, node)
     if config.arms > _MOST:
         raise UserError(f"arms: {_MOST} at most, got {config.arms}")
+    if config.render == "web" and importlib.util.find_spec("viser") is None:
+        raise UserError(f"render=web needs {not_installed('viser')}")
     if node.randomization != compose("train", [f"randomization={config.robot}"]).randomization:
         raise UserError("randomization: the virtual robots take a file of conf/randomization as it is")
     for path, metadata in config.fleet().values():
@@ -77,6 +88,7 @@ def _fleet(node: DictConfig, _: Path) -> None:
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"  # no robot but ours shall hear of this
     from physai.ros.driving.fleet_client import Arm, FleetClient
     from physai.ros.driving.fleet_nodes import fleet_nodes
+    from physai.ros.driving.forked import ForkedNode, end
 
     config = validate(FleetConfig, node)
     fleet = config.fleet()
@@ -96,6 +108,10 @@ def _fleet(node: DictConfig, _: Path) -> None:
                 f"{config.arms} arms are many for {cores} cores, and one that is late stops: try arms={enough}"
             )
         nodes = stack.enter_context(fleet_nodes(fleet, config.robot, config.max_velocity, config.seed, logs))
+        if config.render == "web":
+            page = ForkedNode("physai.ros.dashboard", logs / "dashboard", "/", **config.web.model_dump())
+            stack.callback(end, [page])
+            console.print(f"the page: {_address(page)}")
         client = FleetClient({name: metadata for name, (_, metadata) in fleet.items()}, config.seed, tell)
         stack.enter_context(closing(client))
         client.wait_until_ready(nodes)
@@ -107,6 +123,18 @@ def _fleet(node: DictConfig, _: Path) -> None:
                 raise
         for namespace, arm in client.arms.items():
             console.print(f"{namespace}: {arm.reached} of {arm.sent} goals reached; {arm.state}")
+
+
+def _address(page: "ForkedNode") -> str:
+    """Wait until the dashboard says where it is."""
+    until = time.monotonic() + _PATIENCE
+    while time.monotonic() < until:
+        if page.log.exists() and (found := re.search(r"http://[^\s:]+:[0-9]+", page.log.read_text())):
+            return found.group()
+        if page.ended:
+            raise UserError(f"the dashboard has ended: {page.last_words()}")
+        time.sleep(0.05)
+    raise UserError(f"the dashboard has said nothing for {_PATIENCE:g} s")
 
 
 if __name__ == "__main__":

@@ -4,6 +4,7 @@ import os
 import signal
 import sys
 import time
+import urllib.request
 
 import pytest
 from geometry_msgs.msg import PointStamped
@@ -163,11 +164,14 @@ def test_the_demo_drives_a_fleet_and_leaves_nothing_behind(start, policy_path):
 
 
 @pytest.mark.slow
-def test_ctrl_c_ends_the_demo_and_all_of_its_nodes(start, policy_path):
-    process = start.run(fleet(f"policies=[{policy_path}]", "arms=1"))
+def test_ctrl_c_ends_the_demo_and_all_of_its_nodes_and_its_page(start, policy_path):
+    process = start.run(fleet(f"policies=[{policy_path}]", "arms=1", "render=web", "web.port=0"))
+    address = process.says("the page: http://127.0.0.1:", 60.0).split()[-1]
     process.says("all of them work", 60.0)
+    with urllib.request.urlopen(address, timeout=30.0) as page:
+        assert b"viser" in page.read().lower()
     nodes = children(process)
-    assert len(nodes) == 3
+    assert len(nodes) == 4
     process.signal(signal.SIGINT)
     assert process.wait(30) == 0, process.output
     assert not any(map(runs, nodes))
@@ -195,6 +199,7 @@ def runs(pid: int) -> bool:
     [
         (["arms=10"], "arms: 9 at most, got 10"),
         (["policies=[nowhere.pt]"], "nowhere.pt: no such file"),
+        (["render=video"], "render: input should be 'web'"),
         (["arm=3"], "unknown key 'arm'; did you mean 'arms'?"),
     ],
 )
