@@ -19,7 +19,7 @@ from physai.ros.live.status import Level, Status, stop_words
 from physai.web.door import Door, Visitor, commander
 
 _FRAMES = 20.0  # pictures a second
-_WORDS, _PATHS, _SAMPLES, _PLOTS = 0.2, 0.5, 0.5, 2.0  # s between two updates
+_STATES, _WORDS, _PATHS, _SAMPLES, _PLOTS = 0.1, 0.3, 0.5, 0.5, 2.0  # s between two updates
 _MINUTES = 3
 _ASLEEP = 0.5  # s without a picture: then this program stood still, and what has waited for it is old
 _DEAF = 1.0  # s after that, in which what has waited arrives
@@ -66,7 +66,8 @@ class Page:
     def run(self, ended: threading.Event) -> None:
         """Show what there is until it shall end."""
         tasks: list[tuple[float, Callable[[list[Status], float], None]]] = [
-            (_WORDS, self._write),
+            (_STATES, self._write_states),
+            (_WORDS, self._write_cards),
             (_SAMPLES, self._sample),
             (_PATHS, self._draw_paths),
             (_PLOTS, self._plot),
@@ -185,16 +186,19 @@ class Page:
 
         return add if self._commands else lambda: None
 
-    def _write(self, robots: list[Status], now: float) -> None:
+    def _write_states(self, robots: list[Status], now: float) -> None:
         lines = []
         for robot in robots:
             level, words = robot.headline(now)
             lines.append(f"{_dot(level)} <b>{html.escape(robot.name)}</b> {html.escape(words)}")
-            arm = self._arms.get(robot.namespace)
-            self._cards[robot.namespace].write(robot, arm.distance if arm else math.nan, now)
         if self._robots.stopped is not None and now - self._robots.stopped < 60.0:
             lines.insert(0, f"<b>{html.escape(stop_words(self._robots.stopped, robots, now))}</b>")
         _set(self._summary, _lines(lines or ["No inference node is there yet."]))
+
+    def _write_cards(self, robots: list[Status], now: float) -> None:
+        for robot in robots:
+            arm = self._arms.get(robot.namespace)
+            self._cards[robot.namespace].write(robot, arm.distance if arm else math.nan, now)
 
     def _draw_paths(self, robots: list[Status], now: float) -> None:
         for arm in self._arms.values():
