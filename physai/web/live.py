@@ -63,7 +63,6 @@ class LivePage:
 
     def __init__(self, server: Server, choices: Choices, robot: DrivenRobot) -> None:
         self._server, self._choices, self._robot = server, choices, robot
-        self._floor = server.floor.position
         self._numbers: dict[int, viser.GuiSliderHandle[float]] = {}
         self._told = np.zeros(0)  # the goal that they show
         self._asked: queue.SimpleQueue[Callable[[], Any]] = queue.SimpleQueue()
@@ -132,7 +131,9 @@ class LivePage:
         """Draw what has been chosen."""
         robot = self._robot
         simulation = robot.simulation
-        self._scene = RobotScene(self._server, "robot", Appearance.of_robot(simulation.spec))
+        look = Appearance.of_robot(simulation.spec)
+        self._scene = RobotScene(self._server, "robot", look)
+        self._server.floor.position = (0.0, 0.0, look.floor)
         task = simulation.task
         self._marker = GoalMarker(
             self._scene, self._server, task.goal, task.tolerances, task.region, simulation.spec.home, self._drag
@@ -154,7 +155,8 @@ class LivePage:
         if not self._wanted.visible:
             return
         with self._wanted:
-            for number, (label, low, high) in enumerate(zip(goal.labels, *goal.bounds, strict=True)):
+            labels = goal.labels or tuple(f"number {number}" for number in range(1, goal.size + 1))
+            for number, (label, low, high) in enumerate(zip(labels, *goal.bounds, strict=True)):
                 if low < high:
                     step, name = (high - low) / 100, label.replace("_", " ")
                     slider = self._server.gui.add_slider(name, low, high, step, np.clip(0.0, low, high).item())
@@ -230,7 +232,7 @@ class LivePage:
         self._scene.show(self._robot.joint_position)
         if (pose := self._robot.base_pose) is not None:  # it walks on the spot, and the floor moves below it
             self._scene.move_base(on_the_spot(pose))
-            self._server.floor.position = (*(-np.fmod(pose[:2], CELL)), self._floor[2])
+            self._server.floor.position = (*-np.fmod(pose[:2], CELL), self._scene.appearance.floor)
         if not self._dragging:  # else the browser knows better where it is
             self._marker.show(self._robot.goal)
         if not np.array_equal(self._robot.goal, self._told):  # else the sliders know better

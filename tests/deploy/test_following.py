@@ -335,7 +335,7 @@ def test_a_payload_beyond_the_drives_is_a_fault(policy, reacher):
     def load(dynamics):
         dynamics["payload"][:] = 500.0  # kg, on drives of 5 and 3 N·m
 
-    for controller in simulate(policy, reacher, 10, 1.0, "none", seed=22, change=load):
-        assert controller.snapshot()["state"] in ("fault", "reached")
-        if controller.snapshot()["state"] == "fault":
-            assert controller.snapshot()["counters"]["faults: following"] == 1
+    found = [controller.snapshot() for controller in simulate(policy, reacher, 10, 1.0, "none", seed=22, change=load)]
+    faults = [each["counters"]["faults: following"] for each in found if each["state"] == "fault"]
+    assert len(faults) >= 8  # one that begins near its goal is asked for next to nothing
+    assert set(faults) == {1}

@@ -83,7 +83,7 @@ def test_in_a_hold_it_keeps_what_it_was_told_and_goes_on_when_it_is_heard_of_aga
     assert len(held) >= 3
     assert all(np.array_equal(command.value, held[0].value) for command in held)
     assert any(text in held[-1].reasons[0] for text in ("the last joint state is", "the last reading of the IMU is"))
-    assert np.abs(held[0].value - told).max() < 0.5
+    assert np.abs(held[0].value - told).max() < 0.7  # rad: no farther than the gait swings in as many steps
     assert [command.state for command in legs.ticks(8, goal=AHEAD)][-3:] == [State.ACTIVE] * 3
 
 

@@ -61,6 +61,7 @@ def test_two_that_take_turns_are_named(peer):
 def test_legs_are_no_arm_of_a_fleet_and_take_no_goal_to_start_with(walking_run, walking_policy):
     path = walking_run / "policy.pt"
     fleet = {"arms": 2, "max_velocity": 1.0, "hold": 1.0, "seconds": 1.0, "randomization": {}, "seed": 0}
+    fleet |= {"render": None, "web": {"host": "127.0.0.1", "port": 0}}
     with pytest.raises(UserError, match="a fleet is of arms, and 'a1' is on legs"):
         FleetConfig(policies=[str(path)], **fleet).fleet()
     with pytest.raises(UserError, match=r"goal: a velocity is out of date .* send them on ~/cmd_vel"):
