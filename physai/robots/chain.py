@@ -89,6 +89,8 @@ def carried(joints: Sequence[Joint], base: str, driven: Sequence[str]) -> dict[s
         for joint in joints:
             if joint.parent != parent:
                 continue
+            if joint.child in found:
+                raise UserError(f"joint '{joint.name}' closes a loop: '{joint.child}' is carried already")
             turns = joint.name in driven
             here = (driven.index(joint.name) + 1, np.eye(4)) if turns else (body, frame @ transform(joint.origin))
             found[joint.child] = here

@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 import viser
 
-from physai.errors import UserError
 from physai.ros.live.arm_view import ArmView
 from physai.ros.live.robots import Ask, Robots
 from physai.ros.live.status import Level, Status, stop_words
@@ -158,7 +157,7 @@ class Page:
         try:
             self._arms[name] = ArmView(self._server, robot, drag)
             self._bad.pop(name, None)
-        except UserError as error:
+        except Exception as error:  # whatever a description of anybody makes of what draws it: the page goes on
             self._bad[name] = robot.description, robot.goal_description
             self._cards[name].problem = f"it cannot be drawn: {error}"
         else:
