@@ -51,6 +51,7 @@ class Forge:
             what, pid, *code = line.split()
             with self._told:
                 if what == "started":
+                    self.codes.pop(int(pid), None)  # of another process that had its number
                     self._pids.append(int(pid))
                 else:
                     self.codes[int(pid)] = int(code[0])

@@ -10,6 +10,7 @@ from physai.deploy.reading import PolicyError, array, get
 
 _PARTS = ("constant", "cosine", "sine")
 _MOST_FEET = 100
+_FARTHEST = 1e3  # m; what is farther away overflows where it is drawn
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,12 +48,15 @@ class Kinematics:
             return None
         constant, cosine, sine = (array(raw, f"kinematics.{key}", (joints, 4, 4)) for key in _PARTS)
         if "feet" not in get(raw, "kinematics", dict):
-            return cls(Motions(constant, cosine, sine), ((joints, array(raw, "kinematics.tip", (4, 4))),))
+            tip = array(raw, "kinematics.tip", (4, 4))
+            _check_size(constant, cosine, sine, tip)
+            return cls(Motions(constant, cosine, sine), ((joints, tip),))
         carriers = array(raw, "kinematics.carriers", (joints,))
         feet = get(raw, "kinematics.feet", list)
         if not 0 < len(feet) <= _MOST_FEET:
             raise PolicyError("metadata: kinematics.feet must be a list of places")
         places = array(raw, "kinematics.feet", (len(feet), 4))
+        _check_size(constant, cosine, sine, places)
         bodies = np.concatenate([carriers, places[:, 0]])
         if not (bodies == bodies.round()).all() or not ((bodies >= 0) & (bodies <= joints)).all():
             raise PolicyError(f"metadata: kinematics: bodies must be numbered from 0 to {joints}")
@@ -64,6 +68,11 @@ class Kinematics:
         if not 0 < height < 100:
             raise PolicyError("metadata: kinematics.height must be positive, and below 100 m")
         return cls(motions, tuple((int(body), _at(place)) for body, *place in places), height)
+
+
+def _check_size(*parts: np.ndarray) -> None:
+    if any(np.abs(part).max() > _FARTHEST for part in parts):
+        raise PolicyError(f"metadata: kinematics: a number is beyond {_FARTHEST:g}")
 
 
 def _at(place: list[float]) -> np.ndarray:

@@ -218,6 +218,8 @@ class RobotSpec:
         driven = tuple(config.joints)
         shapes = None
         if config.collision is not None:
+            if tip is None:
+                raise UserError(f"robot '{config.name}': collision: capsules need an end_effector")
             shapes = collision.model(path, robot, chain, driven, config.collision)
         if config.action == "offset" and config.command != "joint_position":
             raise UserError(f"robot '{config.name}': action: offset needs command: joint_position")

@@ -23,10 +23,12 @@ class Described:
     Attributes:
         joints: Names of the n joints that turn, from the base on.
         appearance: How they are drawn.
+        height: Of the link that the first of them turn in, above the root, m: legs hang from it.
     """
 
     joints: tuple[str, ...]
     appearance: Appearance
+    height: float
 
     @classmethod
     def read(cls, text: str) -> "Described":
@@ -45,7 +47,10 @@ class Described:
                 raise UserError("the robot's description has no joint that turns")
             meshes = visual_bodies(path, base, joints)
         moves = motions(order, base, joints)
-        return cls(joints, Appearance.of_shapes(moves, meshes, _tip(order, base, joints, moves.carriers)))
+        first = next(joint for joint in order if joint.name == joints[0])
+        _, frame = carried(order, base, joints)[first.parent]
+        look = Appearance.of_shapes(moves, meshes, _tip(order, base, joints, moves.carriers))
+        return cls(joints, look, float(frame[2, 3]))
 
 
 def _from_base(robot: Robot) -> tuple[str, list[Joint]]:

@@ -95,7 +95,7 @@ class DrivenRobot:
         parameters, goal = self.simulation.physics_parameters, self.simulation.goal
         self._tensordict = self._env.reset()
         self.simulation.change(parameters)
-        if self.simulation.task.goal.quantity is Quantity.TWIST:  # who told it to walk has not told it to stop
+        if self.simulation.task.goal.quantity not in (Quantity.POSITION, Quantity.POSE):  # people asked for that one
             self.simulation.aim(goal)
         self._begin_goal()
 

@@ -71,10 +71,18 @@ class RobotScene:
             with self._server.atomic():
                 self._base.position, self._base.wxyz = pose[:3], np.roll(pose[3:], 1)
 
-    def turn_base(self, turn: np.ndarray) -> None:
-        """Show a base that floats turned by a quaternion x, y, z, w, [4]; what is none leaves it as it is."""
+    def turn_base(self, turn: np.ndarray, height: float) -> None:
+        """Show a robot whose drawing begins at the floor turned about its base.
+
+        Args:
+            turn: Quaternion x, y, z, w, [4]; what is none leaves it as it is.
+            height: Of the base above the floor, m.
+        """
         if abs(np.linalg.norm(turn) - 1.0) < _NO_UNIT:  # and of numbers that are not finite, nothing is near
-            self._base.wxyz = np.roll(turn, 1)
+            center = np.array([0.0, 0.0, height])
+            with self._server.atomic():
+                self._base.position = center - Rotation.from_quat(turn).apply(center)
+                self._base.wxyz = np.roll(turn / np.linalg.norm(turn), 1)
 
     def place(self, position: tuple[float, float, float]) -> None:
         """Have it stand elsewhere, m."""

@@ -46,6 +46,7 @@ def legs(env_config):
         ("feet", [[13, 0.0, 0.0, 0.0]], "bodies must be numbered from 0 to 12"),
         ("feet", [[3, 0.0, 0.0]], "kinematics.feet must have the shape [1, 4]"),
         ("feet", [[3, 0.0, None, 0.0]], "kinematics.feet must be finite"),
+        ("feet", [[3, 1e308, 1e308, 0.0]], "kinematics: a number is beyond 1000"),
         ("height", 0, "kinematics.height must be positive"),
         ("height", "tall", "kinematics.height must hold numbers"),
         ("constant", [[1.0]], "kinematics.constant must have the shape [12, 4, 4]"),

@@ -166,8 +166,8 @@ def test_the_demo_drives_a_fleet_and_leaves_nothing_behind(start, policy_path):
 @pytest.mark.slow
 def test_ctrl_c_ends_the_demo_and_all_of_its_nodes_and_its_page(start, policy_path):
     process = start.run(fleet(f"policies=[{policy_path}]", "arms=1", "render=web", "web.port=0"))
-    address = process.says("the page: http://127.0.0.1:", 60.0).split()[-1]
     process.says("all of them work", 60.0)
+    address = process.says("the page: http://127.0.0.1:", 60.0).split()[-1]
     with urllib.request.urlopen(address, timeout=30.0) as page:
         assert b"viser" in page.read().lower()
     nodes = children(process)

@@ -48,11 +48,12 @@ def test_a_base_that_floats_is_drawn_where_it_is_and_walks_on_the_spot(env_confi
         assert robot._base.position == pytest.approx([0.0, 0.0, 0.3])
         assert robot._base.wxyz == pytest.approx([0.0, 0.0, 0.0, 1.0])
         for bad in ([0.0, 0.0, 0.0, 0.0], [np.nan, 0.0, 0.0, 1.0], [2.0, 0.0, 0.0, 0.0]):
-            robot.turn_base(np.array(bad))
+            robot.turn_base(np.array(bad), 0.3)
             robot.move_base(np.array([np.inf, 0.0, 0.3, *bad]))
         assert robot._base.wxyz == pytest.approx([0.0, 0.0, 0.0, 1.0])
-        robot.turn_base(np.array([0.0, 1.0, 0.0, 0.0]))
+        robot.turn_base(np.array([0.0, 1.05, 0.0, 0.0]), 0.3)
         assert robot._base.wxyz == pytest.approx([0.0, 0.0, 1.0, 0.0])
+        assert robot._base.position == pytest.approx([0.0, 0.0, 0.6])  # its trunk, 0.3 m above, stays where it was
 
 
 def test_a_policy_file_is_drawn_by_its_urdf_or_says_why_it_cannot_be(exported_run, monkeypatch):

@@ -88,7 +88,7 @@ class ArmView:
                 self._position = position
                 self._scene.show(position)
         if status.turn is not None:
-            self._scene.turn_base(status.turn)
+            self._scene.turn_base(status.turn, self._described.height)
         self._color(level)
         tip = self._described.appearance.tip_position(self._position) if np.isfinite(self._position).all() else None
         if tip is not None and (not self._path or np.linalg.norm(tip - self._path[-1]) > _STEP):

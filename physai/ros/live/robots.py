@@ -218,7 +218,8 @@ class _Link:
 
     def _take_imu(self, message: Imu) -> None:
         turn = message.orientation
-        self.status.turn = np.array([turn.x, turn.y, turn.z, turn.w])
+        known = message.orientation_covariance[0] != -1  # sensor_msgs/Imu: else it has none
+        self.status.turn = np.array([turn.x, turn.y, turn.z, turn.w]) if known else None
 
     def say(self, words: str) -> None:
         """Tell what became of what was asked."""
