@@ -6,6 +6,7 @@ import re
 from collections.abc import Iterable
 from typing import Annotated, Any, TypeVar
 
+import numpy as np
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
@@ -24,11 +25,18 @@ def _whole(value: Any) -> Any:
     return int(value) if isinstance(value, float) and value.is_integer() else value
 
 
+def _listed(value: Any) -> Any:
+    """Let people write one number that is the same for all."""
+    return [value] if isinstance(value, int | float) and not isinstance(value, bool) else value
+
+
 Seed = Annotated[int, Field(ge=0, lt=2**32)]
 Count = Annotated[int, BeforeValidator(_whole), Field(gt=0)]
 PackageName = Annotated[str, Field(pattern=r"^[A-Za-z_]\w*(\.[A-Za-z_]\w*)*$", max_length=100)]
 PositiveFloat = Annotated[float, Field(gt=0)]
 NonNegativeFloat = Annotated[float, Field(ge=0)]
+EachPositive = Annotated[list[PositiveFloat], BeforeValidator(_listed)]
+EachNonNegative = Annotated[list[NonNegativeFloat], BeforeValidator(_listed)]
 
 
 class PageConfig(Config):
@@ -41,8 +49,8 @@ class PageConfig(Config):
 C = TypeVar("C", bound=Config)
 
 
-def validate(model: type[C], node: DictConfig) -> C:
-    """Turn a composed config into its typed model.
+def validate(model: type[C], node: DictConfig, where: str = "") -> C:
+    """Turn a composed config into its typed model; of a part of one, ``where`` is its key with a dot, for errors.
 
     Raises:
         UserError: One line that names the first bad key, what was expected, and what came.
@@ -57,9 +65,9 @@ def validate(model: type[C], node: DictConfig) -> C:
         return model.model_validate(data)
     except ValidationError as error:
         first = error.errors()[0]
-        key = ".".join(str(part) for part in first["loc"])
+        key = where + ".".join(str(part) for part in first["loc"])
         if first["type"] == "extra_forbidden":
-            known = [name for name in keys(node) if name != key and not name.startswith(f"{key}.")]
+            known = [name for name in keys(node, where) if name != key and not name.startswith(f"{key}.")]
             raise UserError(f"unknown key '{key}'{nearest(key, known)}") from error
         if first["type"] == "missing":
             raise UserError(f"{key} is missing") from error
@@ -67,6 +75,17 @@ def validate(model: type[C], node: DictConfig) -> C:
             raise UserError(f"{key}{first['ctx']['error']}") from error
         message = first["msg"][0].lower() + first["msg"][1:]
         raise UserError(f"{key}: {message}, got {first['input']!r}") from error
+
+
+def of_each(values: list[float], joints: int, where: str) -> np.ndarray:
+    """Return a value for each joint, [n], from as many, or from one that is the same for all.
+
+    Raises:
+        UserError: If they are of another number; it says ``where``.
+    """
+    if len(values) not in (1, joints):
+        raise UserError(f"{where} has {len(values)} values for {joints} joints")
+    return np.broadcast_to(np.array(values, dtype=np.float64), joints).copy()
 
 
 def nearest(name: str, options: Iterable[str]) -> str:

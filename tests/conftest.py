@@ -7,7 +7,7 @@ import signal
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import redirect_stdout
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -48,11 +48,12 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    made = {"panda_run", "position_run", "recurrent_run", "small_run", "walking_run"}
     for item in items:
-        made = {"panda_run", "position_run", "recurrent_run", "small_run"}.intersection(
-            getattr(item, "fixturenames", ())
-        )
-        if made or item.get_closest_marker("realtime"):  # a run of their own is made for them; or they run apart
+        asked = [*getattr(item, "fixturenames", ())]
+        asked += getattr(getattr(item, "callspec", None), "params", {}).values()  # to be got by name
+        # A run of their own is made for them; or they run apart.
+        if any(name in made for name in asked if isinstance(name, str)) or item.get_closest_marker("realtime"):
             item.add_marker(pytest.mark.slow)
     if (chosen := config.getoption("--realtime")) is None:
         return
@@ -93,6 +94,7 @@ def _one_thread():
     torch.set_num_threads(1)
 
 
+@cache  # to compose a config takes a fifth of a second
 def _env_config(name: str, *overrides: str) -> EnvConfig:
     return validate(EnvConfig, compose("train", [f"env={name}", *overrides]).env)
 
@@ -108,10 +110,8 @@ def reacher() -> EnvConfig:
     return _env_config("reacher")
 
 
-def _simulated_envs() -> list[str]:
-    """All files of ``conf/env`` whose robots are simulated; what is added there is tested, too."""
-    names = sorted(path.stem for path in (conf_dir() / "env").glob("*.yaml"))
-    return [name for name in names if _env_config(name).simulated]
+_ENVS = sorted(path.stem for path in (conf_dir() / "env").glob("*.yaml"))  # what is added there is tested, too
+_SIMULATED_ENVS = [name for name in _ENVS if _env_config(name).simulated]
 
 
 @pytest.fixture(scope="session")
@@ -126,7 +126,7 @@ def two_joint_env(request: pytest.FixtureRequest) -> EnvConfig:
 
 
 def _first_of_each_robot(floats: bool) -> list[str]:
-    configs = {name: _env_config(name).robot for name in reversed(_simulated_envs())}
+    configs = {name: _env_config(name).robot for name in reversed(_SIMULATED_ENVS)}
     robots = {robot.name: name for name, robot in configs.items() if (robot.floating is not None) == floats}
     return sorted(robots.values())
 
@@ -143,7 +143,7 @@ def any_legged(request: pytest.FixtureRequest) -> EnvConfig:
     return _env_config(request.param)
 
 
-@pytest.fixture(scope="session", params=_simulated_envs())
+@pytest.fixture(scope="session", params=_SIMULATED_ENVS)
 def any_env(request: pytest.FixtureRequest) -> EnvConfig:
     """Each environment in turn."""
     return _env_config(request.param)

@@ -1,5 +1,6 @@
-"""The examples of CONTRIBUTING.md, followed to the letter in a copy of the project."""
+"""The examples of CONTRIBUTING.md and of docs/walk.md, followed to the letter in a copy of the project."""
 
+import json
 import re
 import shutil
 import subprocess
@@ -8,15 +9,13 @@ from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).parent.parent
-EXAMPLE = re.compile(r"^`(\S+/\S+)`:\n\n```\w+\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+from tests.docs.blocks import ROOT, shown_files
 
 
 @pytest.fixture(scope="module")
 def examples() -> dict[str, str]:
-    """What CONTRIBUTING.md shows, by the file that it belongs into."""
-    found = EXAMPLE.finditer((ROOT / "CONTRIBUTING.md").read_text())
-    return {match[1]: match[2] for match in found}
+    """What these pages show, by the file that it belongs into."""
+    return shown_files("CONTRIBUTING.md") | shown_files("docs/walk.md")
 
 
 @pytest.fixture(scope="module")
@@ -43,16 +42,24 @@ def test_there_is_an_example_of_everything(examples):
         "conf/robot",
         "conf/env",
         "conf/algo",
+        "conf/training",
     }
 
 
 @pytest.mark.slow
 def test_the_discovery_tests_pick_up_what_is_added(project):
-    added = "(long_arm or long_reacher or joint_reach or reuse) and not impulse and not servo"  # one engine will do
+    names = ("long_arm", "long_reacher", "joint_reach", "reuse", "mini_cheetah")
+    added = f"({' or '.join(names)}) and not impulse and not servo"  # one engine will do
     tests = ("tests/test_config.py", "tests/robots", "tests/tasks", "tests/physics")
     result = run(project, "-m", "pytest", "-vv", "-p", "no:cacheprovider", "-k", added, *tests)
     assert result.returncode == 0, result.stdout
-    for name in ("robot@env.robot=long_arm", "env=long_reacher", "env=joint_reach", "algo=reuse"):
+    for name in (
+        "robot@env.robot=long_arm",
+        "env=long_reacher",
+        "env=joint_reach",
+        "algo=reuse",
+        "env=mini_cheetah_walk",
+    ):
         assert re.search(rf"test_every_choice_builds_and_collects\[{re.escape(name)}\] PASSED", result.stdout), name
     assert "test_kinematics.py" in result.stdout  # robots are also held against PyBullet
 
@@ -65,3 +72,13 @@ def test_all_of_it_trains_together(project):
     result = run(project, "-m", "physai.train", *choice, *tiny, "hydra.run.dir=run")
     assert result.returncode == 0, result.stdout + result.stderr
     assert (project / "run" / "policy.pt").is_file()
+
+
+@pytest.mark.slow
+def test_another_robot_on_legs_trains_and_is_exported(project):
+    tiny = ("total_frames=12_288", "evaluation.goals=8", "evaluation.episodes=16", "env.task.max_steps=150")
+    result = run(project, "-m", "physai.train", "env=mini_cheetah_walk", "physics=mujoco", *tiny, "hydra.run.dir=legs")
+    assert result.returncode == 0, result.stdout + result.stderr
+    assert (project / "legs" / "policy.pt").is_file()
+    summary = json.loads((project / "legs" / "summary.json").read_text())
+    assert summary["crashed_rate"] == 0

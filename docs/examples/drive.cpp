@@ -84,7 +84,7 @@ Policy load(const std::string& path, std::string hash) {
     torch::jit::ExtraFilesMap extra = {{"metadata.json", ""}};
     auto module = torch::jit::freeze(torch::jit::load(content, torch::kCPU, extra));
     const std::string& metadata = extra["metadata.json"];
-    if (metadata.find("\"format_version\": 3,") == std::string::npos) throw Error("not a policy of format 3");
+    if (metadata.find("\"format_version\": 4,") == std::string::npos) throw Error("not a policy of format 4");
     // Of the metadata's JSON, the golden pairs are lists of numbers by name, which TorchScript writes in the same way.
     const size_t start = metadata.find('{', metadata.find("\"golden\":")), end = metadata.find('}', start) + 1;
     const auto reader = torch::jit::compile("def golden():\n    pairs = " + metadata.substr(start, end - start) +

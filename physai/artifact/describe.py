@@ -17,8 +17,7 @@ from physai.collision import CollisionModel
 from physai.deploy.kinematics import Kinematics
 from physai.deploy.metadata import FORMAT, FORMAT_VERSION, describe_region, describe_signal
 from physai.envs.simulation import Simulation
-from physai.robots import RobotSpec
-from physai.robots.chain import carried
+from physai.robots import RobotSpec, feet
 
 
 def describe_robot(simulation: Simulation, policy: DeployablePolicy) -> dict[str, Any]:
@@ -56,14 +55,7 @@ def kinematics(spec: RobotSpec) -> Kinematics:
     if (tip := spec.tip) is not None:
         return Kinematics(spec.motions, ((len(spec.joints), tip),))
     assert spec.floating is not None
-    links, feet = carried(spec.linkage, spec.base, spec.joints), []
-    for sphere in spec.floating.spheres:
-        if sphere.link in spec.floating.foot_links:
-            body, frame = links[sphere.body]
-            end = np.eye(4)
-            end[:3, 3] = frame[:3, :3] @ sphere.center + frame[:3, 3]
-            feet.append((body, end))
-    return Kinematics(spec.motions, tuple(feet), spec.floating.height)
+    return Kinematics(spec.motions, feet(spec), spec.floating.height)
 
 
 def capsules(simulation: Simulation) -> CollisionModel | None:

@@ -160,7 +160,7 @@ def _respond(config: EnvConfig) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """
     joints = len(config.robot.joints)
     rows = joints * len(_SCALES)
-    at_home = config.start.model_copy(update={"spread": [0.0] * joints, "carried_over": 0.0})
+    at_home = config.start.model_copy(update={"spread": [0.0], "carried_over": 0.0})
     simulation = Simulation(config.model_copy(update={"start": at_home}), rows, seed=0)
     with closing(simulation):
         told, every = np.repeat(np.arange(joints), len(_SCALES)), np.arange(rows)

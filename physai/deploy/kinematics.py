@@ -6,10 +6,10 @@ from typing import Any
 import numpy as np
 
 from physai.collision import Motions
-from physai.deploy.reading import PolicyError, array, get
+from physai.deploy.reading import PolicyError, array, items
 
 _PARTS = ("constant", "cosine", "sine")
-_MOST_FEET = 100
+_MOST_ENDS = 100
 _FARTHEST = 1e3  # m; what is farther away overflows where it is drawn
 
 
@@ -30,12 +30,13 @@ class Kinematics:
 
     def describe(self) -> dict[str, Any]:
         """Return it as JSON holds it."""
-        told = {key: getattr(self.motions, key).tolist() for key in _PARTS}
-        if not self.height:
-            ((_, tip),) = self.ends
-            return told | {"tip": tip.tolist()}
-        feet = [[body, *frame[:3, 3].tolist()] for body, frame in self.ends]
-        return told | {"carriers": list(self.motions.carriers), "feet": feet, "height": self.height}
+        return {
+            **{key: getattr(self.motions, key).tolist() for key in _PARTS},
+            "carriers": list(self.motions.carriers),
+            "end_carriers": [body for body, _ in self.ends],
+            "ends": [frame.tolist() for _, frame in self.ends],
+            "height": self.height,
+        }
 
     @classmethod
     def read(cls, raw: dict[str, Any], joints: int) -> "Kinematics | None":
@@ -47,17 +48,13 @@ class Kinematics:
         if "kinematics" not in raw:
             return None
         constant, cosine, sine = (array(raw, f"kinematics.{key}", (joints, 4, 4)) for key in _PARTS)
-        if "feet" not in get(raw, "kinematics", dict):
-            tip = array(raw, "kinematics.tip", (4, 4))
-            _check_size(constant, cosine, sine, tip)
-            return cls(Motions(constant, cosine, sine), ((joints, tip),))
+        count = len(items(raw, "kinematics.ends", _MOST_ENDS, "frames"))
+        ends = array(raw, "kinematics.ends", (count, 4, 4))
+        if any(np.abs(part).max() > _FARTHEST for part in (constant, cosine, sine, ends)):
+            raise PolicyError(f"metadata: kinematics: a number is beyond {_FARTHEST:g}")
         carriers = array(raw, "kinematics.carriers", (joints,))
-        feet = get(raw, "kinematics.feet", list)
-        if not 0 < len(feet) <= _MOST_FEET:
-            raise PolicyError("metadata: kinematics.feet must be a list of places")
-        places = array(raw, "kinematics.feet", (len(feet), 4))
-        _check_size(constant, cosine, sine, places)
-        bodies = np.concatenate([carriers, places[:, 0]])
+        end_carriers = array(raw, "kinematics.end_carriers", (count,))
+        bodies = np.concatenate([carriers, end_carriers])
         if not (bodies == bodies.round()).all() or not ((bodies >= 0) & (bodies <= joints)).all():
             raise PolicyError(f"metadata: kinematics: bodies must be numbered from 0 to {joints}")
         try:
@@ -65,17 +62,6 @@ class Kinematics:
         except ValueError as error:
             raise PolicyError(f"metadata: kinematics: {error}") from error
         height = float(array(raw, "kinematics.height", ()))
-        if not 0 < height < 100:
-            raise PolicyError("metadata: kinematics.height must be positive, and below 100 m")
-        return cls(motions, tuple((int(body), _at(place)) for body, *place in places), height)
-
-
-def _check_size(*parts: np.ndarray) -> None:
-    if any(np.abs(part).max() > _FARTHEST for part in parts):
-        raise PolicyError(f"metadata: kinematics: a number is beyond {_FARTHEST:g}")
-
-
-def _at(place: list[float]) -> np.ndarray:
-    frame = np.eye(4)
-    frame[:3, 3] = place
-    return frame
+        if not 0 <= height < _FARTHEST:
+            raise PolicyError("metadata: kinematics.height must not be negative, nor beyond 1000 m")
+        return cls(motions, tuple(zip(map(int, end_carriers), ends, strict=True)), height)

@@ -15,7 +15,7 @@ from physai.signals import Quantity, Region, Signal, Tolerance
 from physai.signals.region import REGIONS
 
 FORMAT = "physai.policy"
-FORMAT_VERSION = 3
+FORMAT_VERSION = 4
 POSITION, VELOCITY, GOAL = "joint_position", "joint_velocity", "goal"  # which every policy takes
 LAST_COMMAND = "last_command"  # what was sent before: an input of policies that command positions
 MEMORY, NEW_MEMORY = "memory", "new_memory"  # of a policy that remembers: a further input, a further output

@@ -8,7 +8,7 @@ import torch
 from pydantic import AfterValidator, Field
 from torch import Tensor
 
-from physai.config import Config, Count, NonNegativeFloat, PositiveFloat
+from physai.config import Config, Count, EachNonNegative, PositiveFloat, of_each
 from physai.errors import UserError
 from physai.physics import ActuatorDelay, ParameterLayout, Physics, RobotState
 from physai.physics.interface import at_home
@@ -37,12 +37,12 @@ def _says_whether_simulated(node: dict[str, Any]) -> dict[str, Any]:
 class StartConfig(Config):
     """Where episodes begin.
 
-    ``spread``: uniformly within the home pose plus or minus this, rad, one value a joint. ``carried_over``: a share of
-    the episodes that begins where the last one ended, as on a robot that gets one goal after the other. A robot that is
-    not simulated begins at home, for it cannot be put anywhere at once.
+    ``spread``: uniformly within the home pose plus or minus this, rad, one value a joint, or one for all.
+    ``carried_over``: a share of the episodes that begins where the last one ended, as on a robot that gets one goal
+    after the other. A robot that is not simulated begins at home, for it cannot be put anywhere at once.
     """
 
-    spread: list[NonNegativeFloat]
+    spread: EachNonNegative
     carried_over: Annotated[float, Field(ge=0, le=1)]
 
 
@@ -102,10 +102,7 @@ class Simulation:
         self.config = config
         self.num_envs = num_envs
         self.spec = RobotSpec.from_config(config.robot)
-        if len(config.start.spread) != len(self.spec.joints):
-            raise UserError(
-                f"env.start.spread has {len(config.start.spread)} values for {len(self.spec.joints)} joints"
-            )
+        self._spread = of_each(config.start.spread, len(self.spec.joints), "env.start.spread")
         if self.spec.floating is not None and config.start.carried_over:
             raise UserError("env.start.carried_over: a robot whose base floats may have fallen: 0 is needed")
         self._kinematics = ForwardKinematics(self.spec) if self.spec.end_effector else None
@@ -247,9 +244,9 @@ class Simulation:
         position, velocity = home.joint_position, home.joint_velocity
         if not self._simulated:
             return home
-        if any(config.spread):  # else a seed gives the same goals to robots one after the other as side by side
+        if self._spread.any():  # else a seed gives the same goals to robots one after the other as side by side
             draw = torch.rand(position.shape, generator=self.generator, dtype=torch.float64).numpy()
-            position = np.clip(position + (2 * draw - 1) * np.array(config.spread), *spec.position_limit.T)
+            position = np.clip(position + (2 * draw - 1) * self._spread, *spec.position_limit.T)
         if config.carried_over:
             carried = torch.rand(count, 1, generator=self.generator).numpy() < config.carried_over
             carried &= self.started[rows, None]

@@ -2,6 +2,7 @@
 
 from physai.robots.bodies import engine_urdf
 from physai.robots.command import JointCommand
+from physai.robots.feet import feet, feet_at_home
 from physai.robots.floating import FloatingBase
 from physai.robots.inverse import InverseKinematics
 from physai.robots.kinematics import (
@@ -23,6 +24,8 @@ __all__ = [
     "RobotSpec",
     "angle_between",
     "engine_urdf",
+    "feet",
+    "feet_at_home",
     "quaternion_matrix",
     "rotation_vector",
 ]

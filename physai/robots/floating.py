@@ -9,7 +9,7 @@ import numpy as np
 from pydantic import Field
 from urdf_parser_py.urdf import Robot
 
-from physai.config import Config, NonNegativeFloat, PositiveFloat, nearest
+from physai.config import Config, EachNonNegative, EachPositive, PositiveFloat, nearest, of_each
 from physai.errors import UserError
 from physai.robots.bodies import Body
 from physai.robots.chain import welded
@@ -37,10 +37,10 @@ class FloatingConfig(Config):
 
 
 class ServoConfig(Config):
-    """``stiffness``, N·m/rad, and ``damping``, N·m·s/rad, one value a joint."""
+    """``stiffness``, N·m/rad, and ``damping``, N·m·s/rad, one value a joint, or one for all."""
 
-    stiffness: list[PositiveFloat]
-    damping: list[NonNegativeFloat]
+    stiffness: EachPositive
+    damping: EachNonNegative
 
 
 @dataclass(frozen=True)
@@ -126,7 +126,5 @@ class Servo:
         """Check that there is a value for each joint, and that they take positions; raises a UserError if not."""
         if command != "joint_position":
             raise UserError(f"robot '{name}': a servo needs command: joint_position")
-        for key in ("stiffness", "damping"):
-            if (count := len(getattr(config, key))) != joints:
-                raise UserError(f"robot '{name}': servo.{key} has {count} values for {joints} joints")
-        return cls(np.array(config.stiffness, np.float64), np.array(config.damping, np.float64))
+        values = vars(config).items()
+        return cls(**{key: of_each(each, joints, f"robot '{name}': servo.{key}") for key, each in values})

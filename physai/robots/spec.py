@@ -9,7 +9,7 @@ from pydantic import Field
 from urdf_parser_py.urdf import Joint, JointLimit, Robot
 
 from physai.collision import CollisionModel, Motions
-from physai.config import Config, NonNegativeFloat, PositiveFloat, nearest
+from physai.config import Config, EachNonNegative, EachPositive, PositiveFloat, nearest, of_each
 from physai.errors import UserError
 from physai.robots import bodies, collision, urdf
 from physai.robots.bodies import Body, InertialConfig
@@ -20,11 +20,11 @@ from physai.signals import Quantity, Signal
 
 
 class LimitsConfig(Config):
-    """Of joints, one value each: ``position``, lowest and highest, rad; ``velocity``, rad/s; ``effort``, N·m."""
+    """Of each joint: ``position``, lowest and highest, rad; ``velocity``, rad/s; ``effort``, N·m."""
 
     position: list[Annotated[list[float], Field(min_length=2, max_length=2)]]
-    velocity: list[PositiveFloat]
-    effort: list[PositiveFloat]
+    velocity: EachPositive
+    effort: EachPositive
 
 
 class RobotConfig(Config):
@@ -33,10 +33,10 @@ class RobotConfig(Config):
     ``command`` says what drives the joints, and ``command_limit`` what an action of 1 means to each: with ``action:
     speed`` how fast it moves, rad/s, with ``action: offset`` how far from home it goes, rad. Joints that take positions
     either close in on them at ``position_gain``, 1/s, or are the springs of ``servo``. What follows stands in the place
-    of what the URDF says, or does not say: ``limits``, ``damping``, N·m·s/rad, and ``friction``, N·m, one value a
-    joint, and ``inertials`` of links by name. ``gravity`` is in the base's frame, m/s²: it says how the base is
-    mounted. Without ``collision`` nobody asks whether the robot touches itself. ``floating`` is of a base that nothing
-    holds; a robot that has none needs an ``end_effector``.
+    of what the URDF says, or does not say: ``limits``, ``damping``, N·m·s/rad, and ``friction``, N·m, of joints, and
+    ``inertials`` of links by name. One number may stand for all joints. ``gravity`` is in the base's frame, m/s²: it
+    says how the base is mounted. Without ``collision`` nobody asks whether the robot touches itself. ``floating`` is of
+    a base that nothing holds; a robot that has none needs an ``end_effector``.
     """
 
     name: str
@@ -46,13 +46,13 @@ class RobotConfig(Config):
     home: list[float]
     command: Literal["joint_velocity", "joint_position"]
     action: Literal["speed", "offset"]
-    command_limit: list[PositiveFloat]
+    command_limit: EachPositive
     position_gain: PositiveFloat
     servo: ServoConfig | None
     floating: FloatingConfig | None
     limits: LimitsConfig | None
-    damping: list[NonNegativeFloat] | None
-    friction: list[NonNegativeFloat] | None
+    damping: EachNonNegative | None
+    friction: EachNonNegative | None
     gravity: list[float] = Field(min_length=3, max_length=3)
     inertials: dict[str, InertialConfig]
     collision: CollisionConfig | None
@@ -202,13 +202,13 @@ class RobotSpec:
             _give_limits(joints, config.limits, config.name)
         for joint in joints:
             _check_driven(path, joint)
-        per_joint = {key: getattr(config, key) for key in ("home", "command_limit", "damping", "friction")}
-        for key, values in per_joint.items():
-            if values is None:
-                continue
-            if len(values) != len(joints):
-                raise UserError(f"robot '{config.name}': {key} has {len(values)} values for {len(joints)} joints")
-        for joint, speed in zip(joints, config.command_limit, strict=True):
+        told = {key: getattr(config, key) for key in ("home", "command_limit", "damping", "friction")}
+        per_joint = {
+            key: of_each(values, len(joints), f"robot '{config.name}': {key}")
+            for key, values in told.items()
+            if values is not None
+        }
+        for joint, speed in zip(joints, per_joint["command_limit"], strict=True):
             if config.action == "speed" and speed > joint.limit.velocity:
                 raise UserError(
                     f"robot '{config.name}': command_limit: {speed:g} rad/s is beyond the limit of '{joint.name}', "
@@ -245,18 +245,18 @@ class RobotSpec:
             joints=tuple(config.joints),
             base=base,
             end_effector=tip,
-            home=np.array(config.home, dtype=np.float64),
+            home=per_joint["home"],
             position_limit=np.array([_position_limit(joint) for joint in joints]),
             velocity_limit=np.array([joint.limit.velocity for joint in joints], dtype=np.float64),
             effort_limit=np.array([joint.limit.effort for joint in joints], dtype=np.float64),
             command=Quantity(config.command),
             offset=config.action == "offset",
-            command_limit=np.array(config.command_limit, dtype=np.float64),
+            command_limit=per_joint["command_limit"],
             position_gain=config.position_gain,
             servo=servo,
             floating=floating,
-            damping=_dynamics(joints, "damping", config.damping),
-            friction=_dynamics(joints, "friction", config.friction),
+            damping=per_joint.get("damping", _dynamics(joints, "damping")),
+            friction=per_joint.get("friction", _dynamics(joints, "friction")),
             gravity=np.array(config.gravity, dtype=np.float64),
             linkage=tuple(chain if tip else robot.joints),
             bodies=together,
@@ -286,12 +286,12 @@ def _links_below(joint: str, joints: list[Joint], by_name: dict[str, Joint]) -> 
 
 
 def _give_limits(joints: list[Joint], limits: LimitsConfig, name: str) -> None:
-    for key, values in vars(limits).items():
-        if len(values) != len(joints):
-            raise UserError(f"robot '{name}': limits.{key} has {len(values)} values for {len(joints)} joints")
-    told = zip(joints, limits.position, limits.velocity, limits.effort, strict=True)
-    for joint, (lower, upper), velocity, effort in told:
-        joint.limit = JointLimit(effort, velocity, lower, upper)
+    where, count = f"robot '{name}': limits.", len(joints)
+    if len(limits.position) != count:
+        raise UserError(f"{where}position has {len(limits.position)} values for {count} joints")
+    velocity, effort = (of_each(getattr(limits, key), count, where + key) for key in ("velocity", "effort"))
+    for row, (joint, (lower, upper)) in enumerate(zip(joints, limits.position, strict=True)):
+        joint.limit = JointLimit(float(effort[row]), float(velocity[row]), lower, upper)
         if joint.type == "continuous":
             joint.type = "revolute"
 
@@ -317,9 +317,8 @@ def _position_limit(joint: Joint) -> tuple[float, float]:
     return float(joint.limit.lower or 0), float(joint.limit.upper or 0)
 
 
-def _dynamics(joints: list[Joint], key: str, instead: list[float] | None) -> np.ndarray:
-    told = [float(getattr(joint.dynamics, key, None) or 0) for joint in joints]
-    return np.array(told if instead is None else instead, dtype=np.float64)
+def _dynamics(joints: list[Joint], key: str) -> np.ndarray:
+    return np.array([float(getattr(joint.dynamics, key, None) or 0) for joint in joints], dtype=np.float64)
 
 
 def _doubtful(robot: Robot, moving: list[str], config: RobotConfig) -> tuple[str, ...]:

@@ -1,41 +1,26 @@
 """Walk: follow a velocity on legs, without a fall."""
 
-from typing import Annotated
+from typing import Annotated, Any, TypeVar
 
 import numpy as np
 import torch
+from omegaconf import OmegaConf
 from pydantic import Field
 from torch import Tensor
 
-from physai.config import Config, Count, NonNegativeFloat, PositiveFloat
+from physai.config import Config, Count, NonNegativeFloat, PositiveFloat, validate
 from physai.errors import UserError
 from physai.physics import RobotState
 from physai.physics.rotation import rotate_back
 from physai.robots import ForwardKinematics, RobotSpec
 from physai.signals import Box, Quantity, Signal, Tolerance
+from physai.tasks.gait import Gait, joint_gait
 from physai.tasks.interface import ObservationModule, Step, Task
 
 _STILL = 0.05  # m/s and rad/s: a command below it asks to stand
 
+C = TypeVar("C", bound=Config)
 Vector = Annotated[list[float], Field(min_length=3, max_length=3)]
-
-
-class Gait(Config):
-    """A trot to begin with: how far from home each joint goes, rad, while its leg swings and stands.
-
-    Each leg swings in the first half of its period and stands in the second. ``frequency`` is that of the periods, Hz;
-    ``phase`` at which share of a period each joint begins. ``lift`` is how far it goes in the middle of the swing;
-    ``sway`` how far at the beginning of the swing and a quarter of a period later, and the other way half a period
-    after each; ``stride`` how far at the end of the stance, and the other way at its beginning, for each m/s, m/s and
-    rad/s of the command. ``yaw_correction`` is how far each joint goes for each rad/s of yaw rate that is missing.
-    """
-
-    frequency: PositiveFloat
-    phase: list[Annotated[float, Field(ge=0, lt=1)]]
-    lift: list[float]
-    sway: list[Annotated[list[float], Field(min_length=2, max_length=2)]]
-    stride: list[Vector]
-    yaw_correction: list[float]
 
 
 class WalkObservation(ObservationModule):
@@ -65,12 +50,10 @@ class WalkObservation(ObservationModule):
         self.stride: Tensor
         self.yaw_correction: Tensor
         self.register_buffer("home", torch.from_numpy(spec.home).float())
-        self.register_buffer("phase", torch.tensor(gait.phase))
-        self.register_buffer("lift", torch.from_numpy(np.array(gait.lift) / spec.command_limit).float())
-        self.register_buffer("sway", torch.from_numpy(np.array(gait.sway).T / spec.command_limit).float())
-        self.register_buffer("stride", torch.from_numpy(np.array(gait.stride).T / spec.command_limit).float())
-        correction = np.array(gait.yaw_correction) / spec.command_limit
-        self.register_buffer("yaw_correction", torch.from_numpy(correction).float())
+        of_joints = joint_gait(gait, spec)
+        self.register_buffer("phase", torch.from_numpy(of_joints.phase).float())
+        for name in ("lift", "sway", "stride", "yaw_correction"):  # as actions
+            self.register_buffer(name, torch.from_numpy(getattr(of_joints, name) / spec.command_limit).float())
 
     def forward(  # type: ignore[override]
         self,
@@ -180,13 +163,9 @@ class Walk(Task):
         self._commands, self._stand = Box(tuple(low), tuple(high)), stand
         self.goal = Signal("goal", Quantity.TWIST, (3,), *ends, ("vx", "vy", "yaw_rate"), spec.base)
         self.tolerances = Tolerance("velocity", "m/s", tolerance), Tolerance("yaw_rate", "rad/s", yaw_rate_tolerance)
-        gait = gait if isinstance(gait, Gait) else Gait.model_validate(gait)
-        for key in ("phase", "lift", "sway", "stride", "yaw_correction"):
-            if (count := len(getattr(gait, key))) != len(spec.joints):
-                raise UserError(f"env.task.gait.{key} has {count} values for {len(spec.joints)} joints")
-        self.module = WalkObservation(spec, gait)
+        self.module = WalkObservation(spec, _checked(Gait, gait, "env.task.gait."))
         self.observation = _observation(spec, self.goal)
-        self._reward = reward if isinstance(reward, WalkRewards) else WalkRewards.model_validate(reward)
+        self._reward = _checked(WalkRewards, reward, "env.task.reward.")
         self._home, self._height, self._effort = spec.home, spec.floating.height, spec.effort_limit
         self._feet = list(spec.floating.feet)
         self._others = [link for link in range(len(spec.floating.links)) if link not in spec.floating.feet]
@@ -241,6 +220,11 @@ class Walk(Task):
             **{name: dt * rate for name, rate in rates.items()},
             "fall": -weight.fall * self._fallen(state),
         }
+
+
+def _checked(model: type[C], part: C | dict[str, Any], where: str) -> C:
+    """Return a part of a config as its model, which it may be already."""
+    return part if isinstance(part, model) else validate(model, OmegaConf.create(part), where)
 
 
 def _in_heading(state: RobotState) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

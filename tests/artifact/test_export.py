@@ -60,7 +60,7 @@ def test_the_hash_beside_the_policy_is_its_own(exported_run):
 
 def test_the_metadata_says_everything_a_robot_must_know(exported_run):
     raw = metadata_of(exported_run)
-    assert (raw["format"], raw["format_version"]) == ("physai.policy", 3)
+    assert (raw["format"], raw["format_version"]) == ("physai.policy", 4)
     assert raw["robot"]["name"] == "planar_arm"
     assert raw["robot"]["joints"] == ["joint1", "joint2"]
     assert raw["limits"] == {

@@ -11,6 +11,8 @@ from physai.deploy import PolicyError
 from physai.deploy.kinematics import Kinematics
 from physai.robots import RobotSpec
 
+AT_THE_BODY = np.eye(4).tolist()
+
 
 @pytest.mark.parametrize("env", ["reacher", "panda_reach", "a1_walk"])
 def test_it_is_read_as_it_was_written(env_config, env):
@@ -41,13 +43,14 @@ def legs(env_config):
         ("carriers", [12] * 12, "carriers must be a body for each joint that comes before it"),
         ("carriers", [0.5] * 12, "bodies must be numbered from 0 to 12"),
         ("carriers", [-1] * 12, "bodies must be numbered from 0 to 12"),
-        ("feet", [], "kinematics.feet must be a list of places"),
-        ("feet", [[3, 0.0, 0.0, 0.0]] * 101, "kinematics.feet must be a list of places"),
-        ("feet", [[13, 0.0, 0.0, 0.0]], "bodies must be numbered from 0 to 12"),
-        ("feet", [[3, 0.0, 0.0]], "kinematics.feet must have the shape [1, 4]"),
-        ("feet", [[3, 0.0, None, 0.0]], "kinematics.feet must be finite"),
-        ("feet", [[3, 1e308, 1e308, 0.0]], "kinematics: a number is beyond 1000"),
-        ("height", 0, "kinematics.height must be positive"),
+        ("ends", [], "kinematics.ends must be a list of frames"),
+        ("ends", [AT_THE_BODY] * 101, "kinematics.ends must be a list of frames"),
+        ("ends", [AT_THE_BODY] * 3, "kinematics.end_carriers must have the shape [3], not [4]"),
+        ("ends", [[0.0, 0.0, 0.0]] * 4, "kinematics.ends must have the shape [4, 4, 4]"),
+        ("ends", [np.full((4, 4), None).tolist()] * 4, "kinematics.ends must be finite"),
+        ("ends", [np.full((4, 4), 1e308).tolist()] * 4, "kinematics: a number is beyond 1000"),
+        ("end_carriers", [13] * 4, "bodies must be numbered from 0 to 12"),
+        ("height", -1, "kinematics.height must not be negative"),
         ("height", "tall", "kinematics.height must hold numbers"),
         ("constant", [[1.0]], "kinematics.constant must have the shape [12, 4, 4]"),
     ],
@@ -60,7 +63,7 @@ def test_what_is_impossible_is_named(legs, key, value, said):
     assert said in str(error.value)
 
 
-@pytest.mark.parametrize("key", ["carriers", "height", "sine"])
+@pytest.mark.parametrize("key", ["carriers", "end_carriers", "ends", "height", "sine"])
 def test_what_is_missing_is_named(legs, key):
     raw = copy.deepcopy(legs)
     del raw["kinematics"][key]

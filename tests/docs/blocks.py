@@ -13,6 +13,9 @@ FILES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *PAGES]
 _FENCE = re.compile(r"^( *)```(\S*)\n(.*?)^\1```$", re.MULTILINE | re.DOTALL)
 
 
+_FILE = re.compile(r"^`(\S+/\S+)`:\n\n```\w+\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+
+
 @dataclass(frozen=True)
 class Block:
     """One fenced block.
@@ -43,6 +46,11 @@ def blocks(language: str | None = None) -> list[Block]:
             shown = textwrap.dedent(match[3])
             found.append(Block(path.relative_to(ROOT).as_posix(), line, match[2], shown))
     return [block for block in found if language in (None, block.language)]
+
+
+def shown_files(page: str) -> dict[str, str]:
+    """The files that a page shows whole, by the path that it names before each."""
+    return {match[1]: match[2] for match in _FILE.finditer((ROOT / page).read_text())}
 
 
 def commands(text: str) -> list[list[str]]:

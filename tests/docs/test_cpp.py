@@ -211,13 +211,13 @@ def test_another_golden_pair_is_found(drive, exported_run, tmp_path):
 
 
 def test_an_older_format_is_refused(drive, exported_run, tmp_path):
-    content = described((exported_run / "policy.pt").read_bytes(), lambda metadata: metadata.update(format_version=2))
-    assert refused(drive, content, tmp_path) == "not a policy of format 3"
+    content = described((exported_run / "policy.pt").read_bytes(), lambda metadata: metadata.update(format_version=3))
+    assert refused(drive, content, tmp_path) == "not a policy of format 4"
 
 
 def test_a_module_that_is_no_policy_is_refused(drive, tmp_path):
     content = save(torch.jit.script(torch.nn.Linear(2, 2).eval()))
-    assert refused(drive, content, tmp_path) == "not a policy of format 3"
+    assert refused(drive, content, tmp_path) == "not a policy of format 4"
 
 
 def test_a_file_that_is_no_archive_is_refused(drive, tmp_path):

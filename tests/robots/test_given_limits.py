@@ -9,62 +9,53 @@ from physai.config import validate
 from physai.envs.simulation import EnvConfig, Simulation
 from physai.errors import UserError
 from physai.robots import RobotSpec
-
-LEGS = ("fr", "fl", "hr", "hl")
-LIMITS = {"position": [[-0.8, 0.8], [-2.5, 0.5], [0.2, 2.6]] * 4, "velocity": [40.0] * 12, "effort": [18.0] * 12}
-THIGH = [0.002, 0.0, 0.0, 0.002, 0.0, 0.0004]  # that of the URDF is of no body
-TOES = [{"link": f"toe_{leg}", "center": [0.0, 0.0, 0.0], "radius": 0.02} for leg in LEGS]
-CHEETAH = {
-    "name": "mini_cheetah",
-    "urdf": "package://pybullet_data/mini_cheetah/mini_cheetah.urdf",
-    "joints": [
-        name
-        for leg in LEGS
-        for name in (f"torso_to_abduct_{leg}_j", f"abduct_{leg}_to_thigh_{leg}_j", f"thigh_{leg}_to_knee_{leg}_j")
-    ],
-    "inertials": {f"thigh_{leg}": {"mass": 0.634, "com": [0.0, 0.0, -0.02], "inertia": THIGH} for leg in LEGS},
-    "home": [0.0, -0.8, 1.6] * 4,
-    "command_limit": [0.4, 0.7, 0.7] * 4,
-    "servo": {"stiffness": [60.0] * 12, "damping": [1.0] * 12},
-    "limits": LIMITS,
-    "floating": {
-        "height": 0.29,
-        "feet": [toe["link"] for toe in TOES],
-        "spheres": [*TOES, {"link": "body", "center": [0.0, 0.0, 0.0], "radius": 0.05}],
-    },
-}
+from tests.docs.blocks import shown_files
 
 
-def config(physics="mujoco", **changes):
-    node = compose("train", ["env=a1_walk", f"physics={physics}", "env.task.stand=1.0"])
-    robot = OmegaConf.to_container(node.env.robot)
-    floating = robot["floating"] | CHEETAH["floating"]
-    OmegaConf.update(node, "env.robot", robot | CHEETAH | {"floating": floating} | changes, force_add=True)
-    node.env.start.spread = [0.0] * 12
-    return validate(EnvConfig, node.env)
+@pytest.fixture(scope="module")
+def cheetah():
+    """The robot of docs/walk.md."""
+    robot = OmegaConf.create(shown_files("docs/walk.md")["conf/robot/mini_cheetah.yaml"])
+    del robot["defaults"]
+    return robot
 
 
-def test_without_limits_the_line_says_what_gives_them():
+@pytest.fixture
+def config(cheetah):
+    """Compose the config of an env with it, and with changes to it."""
+
+    def config(physics="mujoco", **changes):
+        node = compose("train", ["env=a1_walk", f"physics={physics}", "env.task.stand=1.0", "env.start.spread=0.0"])
+        robot = OmegaConf.merge(OmegaConf.to_container(node.env.robot), cheetah, changes)
+        OmegaConf.update(node, "env.robot", robot, force_add=True)
+        return validate(EnvConfig, node.env)
+
+    return config
+
+
+def test_without_limits_the_line_says_what_gives_them(config):
     with pytest.raises(
         UserError, match=r"joint 'torso_to_abduct_fr_j' has no <limit>: .* the robot's YAML may give 'limits'"
     ):
         RobotSpec.from_config(config(limits=None).robot)
 
 
-def test_limits_of_the_yaml_take_the_place_of_those_of_the_urdf():
-    spec = RobotSpec.from_config(config().robot)
-    np.testing.assert_array_equal(spec.position_limit, LIMITS["position"])
-    np.testing.assert_array_equal(spec.effort_limit, LIMITS["effort"])
-    np.testing.assert_array_equal(spec.velocity_limit, LIMITS["velocity"])
+def test_limits_of_the_yaml_take_the_place_of_those_of_the_urdf(config, cheetah):
+    spec, limits = RobotSpec.from_config(config().robot), cheetah.limits
+    np.testing.assert_array_equal(spec.position_limit, limits.position)
+    np.testing.assert_array_equal(spec.effort_limit, np.full(12, limits.effort))
+    np.testing.assert_array_equal(spec.velocity_limit, np.full(12, limits.velocity))
 
 
-def test_limits_of_another_number_of_joints_are_refused():
-    with pytest.raises(UserError, match=r"robot 'mini_cheetah': limits\.effort has 2 values for 12 joints"):
-        RobotSpec.from_config(config(limits=LIMITS | {"effort": [18.0, 18.0]}).robot)
+@pytest.mark.parametrize(("key", "values"), [("effort", [18.0, 18.0]), ("position", [[-1.0, 1.0]])])
+def test_limits_of_another_number_of_joints_are_refused(config, key, values):
+    line = rf"robot 'mini_cheetah': limits\.{key} has {len(values)} values for 12 joints"
+    with pytest.raises(UserError, match=line):
+        RobotSpec.from_config(config(limits={key: values}).robot)
 
 
 @pytest.mark.parametrize("physics", ["mujoco", "pybullet"])
-def test_it_stands_where_it_is_put(physics):
+def test_it_stands_where_it_is_put(config, physics):
     simulation = Simulation(config(physics), 2, seed=0)
     simulation.reset()
     for _ in range(100):

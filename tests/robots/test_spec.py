@@ -50,8 +50,8 @@ def test_a_command_beyond_the_limit_of_a_joint_names_the_joint():
     )
 
 
-@pytest.mark.parametrize("values", [[2.0], [2.0, 2.0, 2.0]])
-def test_a_command_limit_is_needed_for_each_joint(values):
+@pytest.mark.parametrize("values", [[], [2.0, 2.0, 2.0]])
+def test_a_command_limit_is_needed_for_each_joint_or_one_for_all(values):
     with pytest.raises(UserError, match=f"command_limit has {len(values)} values for 2 joints"):
         spec_of(command_limit=values)
 

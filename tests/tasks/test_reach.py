@@ -256,7 +256,7 @@ def test_what_a_simulation_observes_is_what_a_policy_sees(both, joint_position, 
     [
         ("env.task.goal_radius=[0.5,0.3]", ["env.task.goal_radius", "0.5", "0.3"]),
         ("env.task.goal_radius=[0.3,0.9]", ["env.task.goal_radius", "0.9", "reach", "planar_arm"]),
-        ("env.start.spread=[1.0]", ["env.start.spread", "2 joints"]),
+        ("env.start.spread=[1.0,1.0,1.0]", ["env.start.spread", "2 joints"]),
         ("env.robot.command_limit=[2.0,3.0]", ["command_limit", "3", "joint2", "2.5"]),
     ],
 )

@@ -109,8 +109,7 @@ def test_the_suggested_gait_alone_follows_commands_with_the_robot_that_it_was_ma
 
 
 def test_a_gait_that_feels_how_it_turns_follows_the_yaw_rate_better(simulate):
-    feels_nothing = f"env.task.gait.yaw_correction=[{', '.join(['0.0'] * 12)}]"
-    blind = suggested(simulate(*WHOLE, feels_nothing, robots=64))
+    blind = suggested(simulate(*WHOLE, "env.task.gait.yaw_correction=0.0", robots=64))
     assert suggested(simulate(*WHOLE, robots=64))[1] < 0.92 * blind[1]
 
 
@@ -143,7 +142,9 @@ def test_the_module_says_what_the_policy_sees_in_both_engines_and_scripts(simula
     ("overrides", "line"),
     [
         (("env.task.low=[1,0,0]",), r"env.task.low: .* must not be above env.task.high"),
-        (("env.task.gait.lift=[0]",), "env.task.gait.lift has 1 values for 12 joints"),
+        (("env.task.gait.lift=-0.1",), r"^env.task.gait.lift: input should be greater than or equal to 0, got -0.1"),
+        (("env.task.reward.fall=-1.0",), r"^env.task.reward.fall: input should be greater than or equal to 0, got -1"),
+        (("+env.task.gait.phases=1",), r"^unknown key 'env.task.gait.phases'"),
         (("env.start.carried_over=0.5",), "env.start.carried_over: a robot whose base floats may have fallen"),
         (("robot@env.robot=planar_arm", "env.start.spread=[0,0]"), "'planar_arm' does not walk: its base is fixed"),
     ],

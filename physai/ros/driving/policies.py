@@ -45,7 +45,7 @@ def robot_overrides(metadata: Metadata) -> list[str]:
     return [
         f"robot@env.robot={metadata.robot}",
         *(f"env.robot.{key}={json.dumps(_value(robot, key))}" for key in changed),
-        f"env.start.spread={json.dumps([0.0] * len(robot['joints']))}",
+        "env.start.spread=0.0",
     ]
 
 
