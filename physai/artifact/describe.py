@@ -14,10 +14,9 @@ import physai
 from physai.artifact.module import DeployablePolicy
 from physai.artifact.states import States
 from physai.collision import CollisionModel
-from physai.deploy.kinematics import Kinematics
 from physai.deploy.metadata import FORMAT, FORMAT_VERSION, describe_region, describe_signal
 from physai.envs.simulation import Simulation
-from physai.robots import RobotSpec, feet
+from physai.robots import kinematics_of
 
 
 def describe_robot(simulation: Simulation, policy: DeployablePolicy) -> dict[str, Any]:
@@ -45,17 +44,9 @@ def describe_robot(simulation: Simulation, policy: DeployablePolicy) -> dict[str
             "region": describe_region(task.region),
             "tolerances": [vars(tolerance) for tolerance in task.tolerances],
         },
-        "kinematics": kinematics(spec).describe(),
+        "kinematics": kinematics_of(spec).describe(),
         "collision": None if (model := capsules(simulation)) is None else model.describe(),
     }
-
-
-def kinematics(spec: RobotSpec) -> Kinematics:
-    """Return what each joint of a robot moves, and where its links end."""
-    if (tip := spec.tip) is not None:
-        return Kinematics(spec.motions, ((len(spec.joints), tip),))
-    assert spec.floating is not None
-    return Kinematics(spec.motions, feet(spec), spec.floating.height)
 
 
 def capsules(simulation: Simulation) -> CollisionModel | None:

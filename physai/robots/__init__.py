@@ -2,7 +2,7 @@
 
 from physai.robots.bodies import engine_urdf
 from physai.robots.command import JointCommand
-from physai.robots.feet import feet, feet_at_home
+from physai.robots.ends import ends_at_home, kinematics_of
 from physai.robots.floating import FloatingBase
 from physai.robots.inverse import InverseKinematics
 from physai.robots.kinematics import (
@@ -23,9 +23,9 @@ __all__ = [
     "RobotConfig",
     "RobotSpec",
     "angle_between",
+    "ends_at_home",
     "engine_urdf",
-    "feet",
-    "feet_at_home",
+    "kinematics_of",
     "quaternion_matrix",
     "rotation_vector",
 ]

@@ -202,7 +202,9 @@ class RobotSpec:
             _give_limits(joints, config.limits, config.name)
         for joint in joints:
             _check_driven(path, joint)
-        told = {key: getattr(config, key) for key in ("home", "command_limit", "damping", "friction")}
+        if len(config.home) != len(joints):
+            raise UserError(f"robot '{config.name}': home has {len(config.home)} values for {len(joints)} joints")
+        told = {key: getattr(config, key) for key in ("command_limit", "damping", "friction")}
         per_joint = {
             key: of_each(values, len(joints), f"robot '{config.name}': {key}")
             for key, values in told.items()
@@ -245,7 +247,7 @@ class RobotSpec:
             joints=tuple(config.joints),
             base=base,
             end_effector=tip,
-            home=per_joint["home"],
+            home=np.array(config.home, dtype=np.float64),
             position_limit=np.array([_position_limit(joint) for joint in joints]),
             velocity_limit=np.array([joint.limit.velocity for joint in joints], dtype=np.float64),
             effort_limit=np.array([joint.limit.effort for joint in joints], dtype=np.float64),

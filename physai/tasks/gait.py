@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from physai.config import Config, NonNegativeFloat, PositiveFloat
-from physai.robots import RobotSpec, feet_at_home
+from physai.robots import RobotSpec, ends_at_home
 
 
 class Sway(Config):
@@ -58,7 +58,7 @@ class JointGait:
 
 def joint_gait(gait: Gait, spec: RobotSpec) -> JointGait:
     """Lead the feet with the joints, by the inverse of their Jacobian at home."""
-    places, jacobian = feet_at_home(spec)
+    places, jacobian = ends_at_home(spec)
     x, y = places[:, 0], places[:, 1]
     forward, left, up = np.broadcast_to(np.eye(3)[:, np.newaxis], (3, len(places), 3))
     outward = left * np.sign(y)[:, np.newaxis]

@@ -2,7 +2,7 @@
 
 import hashlib
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import trimesh
@@ -11,8 +11,9 @@ from omegaconf import DictConfig
 from physai.collision import Capsule, CollisionModel, Motions
 from physai.config import validate
 from physai.deploy import Metadata
+from physai.deploy.kinematics import Kinematics
 from physai.errors import UserError
-from physai.robots import RobotConfig, RobotSpec
+from physai.robots import RobotConfig, RobotSpec, kinematics_of
 from physai.robots.visuals import plain, visual_bodies
 
 _ORANGE = (242, 115, 31, 255)  # of what stands in for the robot's own shapes
@@ -48,15 +49,14 @@ class Appearance:
         meshes = visual_bodies(spec.urdf, spec.base, spec.joints)
         if not any(meshes) and spec.collision:
             meshes = _of_model(spec.collision)
-        look = cls.of_shapes(spec.motions, meshes, spec.tip)
-        return look if spec.floating is None else replace(look, floor=0.0)
+        return cls.of_shapes(kinematics_of(spec), meshes)
 
     @classmethod
     def of_policy(cls, metadata: Metadata) -> "Appearance":
         """Draw the robot of a policy file: by its URDF, if it is here and the same, else by what the file tells.
 
         Raises:
-            UserError: If the URDF is not here, and the file holds no capsules.
+            UserError: If the URDF is not here, and the file does not tell what the joints move.
         """
         try:
             spec = robot_of(metadata)
@@ -64,24 +64,24 @@ class Appearance:
                 raise UserError(f"{spec.urdf}: not the URDF that the policy was trained with")
             return cls.of_robot(spec)
         except UserError as error:
-            if metadata.collision is None:
-                raise UserError(f"'{metadata.robot}' cannot be drawn: the policy has no capsules; {error}") from error
-        return cls.of_shapes(metadata.collision.motions, _of_model(metadata.collision), None)
+            if metadata.kinematics is None:
+                raise UserError(f"'{metadata.robot}' cannot be drawn: the policy has no kinematics; {error}") from error
+        return cls.of_shapes(metadata.kinematics, _of_model(metadata.collision) if metadata.collision else [])
 
     @classmethod
-    def of_shapes(cls, moves: Motions, meshes: list[list[trimesh.Trimesh]], tip: np.ndarray | None) -> "Appearance":
+    def of_shapes(cls, kinematics: Kinematics, meshes: list[list[trimesh.Trimesh]]) -> "Appearance":
         """Draw meshes of n + 1 bodies, in their frames; where there are none at all, sticks from joint to joint.
 
         Args:
-            moves: What each driven joint moves.
+            kinematics: What each driven joint moves, and where the links end.
             meshes: Of the base, then of what each driven joint moves.
-            tip: The end effector's frame in that of the last body, 4 x 4; None where nobody has told.
         """
         if not any(meshes):
-            meshes = _sticks(moves, np.eye(4) if tip is None else tip)
+            meshes = _sticks(kinematics)
         floor = min((float(mesh.bounds[0, 2]) for mesh in meshes[0]), default=0.0)
-        reach = _reach(moves, np.eye(4) if tip is None else tip)
-        return cls(moves, tuple(_gltf(each) for each in meshes), reach, min(floor, 0.0), tip)
+        bodies, reach = tuple(_gltf(each) for each in meshes), _reach(kinematics)
+        tip = kinematics.ends[0][1] if len(kinematics.ends) == 1 else None
+        return cls(kinematics.motions, bodies, reach, 0.0 if kinematics.height else min(floor, 0.0), tip)
 
     @property
     def joints(self) -> int:
@@ -109,12 +109,13 @@ def robot_of(metadata: Metadata) -> RobotSpec:
     return RobotSpec.from_config(validate(RobotConfig, DictConfig(robot)))
 
 
-def _reach(moves: Motions, tip: np.ndarray) -> float:
-    lengths, arm = [0.0], moves.carriers.count(0) == 1
+def _reach(kinematics: Kinematics) -> float:
+    moves, lengths = kinematics.motions, [0.0]
+    arm = moves.carriers.count(0) == 1
     for body, place in zip(moves.carriers, moves.constant[:, :3, 3], strict=True):
         lengths.append(lengths[body] + (0.0 if arm and not body else float(np.linalg.norm(place))))
-    lengths[-1] += float(np.linalg.norm(tip[:3, 3]))
-    return max(*lengths, 0.1)
+    ends = [lengths[body] + float(np.linalg.norm(frame[:3, 3])) for body, frame in kinematics.ends]
+    return max(*lengths, *ends, 0.1)
 
 
 def _of_model(model: CollisionModel) -> list[list[trimesh.Trimesh]]:
@@ -137,12 +138,14 @@ def _of_capsules(bodies: int, capsules: Iterable[Capsule]) -> list[list[trimesh.
     return meshes
 
 
-def _sticks(moves: Motions, tip: np.ndarray) -> list[list[trimesh.Trimesh]]:
-    """From each joint to those that it carries, and to the end effector."""
-    ends = [*zip(moves.carriers, moves.constant[:, :3, 3], strict=True), (len(moves), tip[:3, 3])]
-    radius, origin = _STICK * _reach(moves, tip), (0.0, 0.0, 0.0)
+def _sticks(kinematics: Kinematics) -> list[list[trimesh.Trimesh]]:
+    """From each joint to those that it carries, and to where the links end."""
+    moves = kinematics.motions
+    ends = [*zip(moves.carriers, moves.constant[:, :3, 3], strict=True)]
+    ends += [(body, frame[:3, 3]) for body, frame in kinematics.ends]
+    radius, origin = _STICK * _reach(kinematics), (0.0, 0.0, 0.0)
     sticks = [Capsule("", body, origin, tuple(end.tolist()), radius) for body, end in ends]
-    return _of_capsules(len(ends), sticks)
+    return _of_capsules(len(moves) + 1, sticks)
 
 
 def _gltf(meshes: list[trimesh.Trimesh]) -> bytes | None:

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 from urdf_parser_py.urdf import Joint, Robot
 
+from physai.deploy.kinematics import Kinematics
 from physai.errors import UserError
 from physai.robots.chain import carried, motions
 from physai.robots.urdf import load
@@ -49,7 +50,7 @@ class Described:
         moves = motions(order, base, joints)
         first = next(joint for joint in order if joint.name == joints[0])
         _, frame = carried(order, base, joints)[first.parent]
-        look = Appearance.of_shapes(moves, meshes, _tip(order, base, joints, moves.carriers))
+        look = Appearance.of_shapes(Kinematics(moves, _ends(order, base, joints, moves.carriers)), meshes)
         return cls(joints, look, float(frame[2, 3]))
 
 
@@ -68,9 +69,11 @@ def _from_base(robot: Robot) -> tuple[str, list[Joint]]:
     return bases[0], order
 
 
-def _tip(order: list[Joint], base: str, joints: tuple[str, ...], carriers: tuple[int, ...]) -> np.ndarray | None:
-    """The frame of the last link in that of the last body, 4 x 4; None where there are several limbs."""
+def _ends(
+    order: list[Joint], base: str, joints: tuple[str, ...], carriers: tuple[int, ...]
+) -> tuple[tuple[int, np.ndarray], ...]:
+    """The frame of the last link in that of the last body; none where there are several limbs."""
     if carriers != tuple(range(len(joints))):
-        return None
+        return ()
     where = carried(order, base, joints)
-    return next(frame for joint in reversed(order) for body, frame in [where[joint.child]] if body == len(joints))
+    return (next(where[joint.child] for joint in reversed(order) if where[joint.child][0] == len(joints)),)

@@ -6,10 +6,9 @@ import json
 import numpy as np
 import pytest
 
-from physai.artifact.describe import kinematics
 from physai.deploy import PolicyError
 from physai.deploy.kinematics import Kinematics
-from physai.robots import RobotSpec
+from physai.robots import RobotSpec, kinematics_of
 
 AT_THE_BODY = np.eye(4).tolist()
 
@@ -17,7 +16,7 @@ AT_THE_BODY = np.eye(4).tolist()
 @pytest.mark.parametrize("env", ["reacher", "panda_reach", "a1_walk"])
 def test_it_is_read_as_it_was_written(env_config, env):
     spec = RobotSpec.from_config(env_config(env).robot)
-    written = kinematics(spec)
+    written = kinematics_of(spec)
     read = Kinematics.read({"kinematics": json.loads(json.dumps(written.describe()))}, len(spec.joints))
     position = spec.sample(3, np.random.default_rng(0))
     np.testing.assert_array_equal(read.motions.frames(position), written.motions.frames(position))
@@ -33,7 +32,7 @@ def test_a_file_may_tell_nothing():
 
 @pytest.fixture(scope="module")
 def legs(env_config):
-    return {"kinematics": kinematics(RobotSpec.from_config(env_config("a1_walk").robot)).describe()}
+    return {"kinematics": kinematics_of(RobotSpec.from_config(env_config("a1_walk").robot)).describe()}
 
 
 @pytest.mark.parametrize(

@@ -62,7 +62,7 @@ def test_a_command_limit_is_needed_for_each_joint_or_one_for_all(values):
     [
         ("env.robot.command=joint_torque", ["env.robot.command", "'joint_velocity' or 'joint_position'"]),
         ("env.robot.command_limit=[0.0,1.0]", ["command_limit.0", "greater than 0"]),
-        ("env.robot.command_limit=2.0", ["command_limit", "list"]),
+        ("env.robot.command_limit=fast", ["command_limit", "list"]),
         ("env.robot.position_gain=-1.0", ["position_gain", "greater than 0"]),
         ("env.robot.gravity=[0.0,-9.81]", ["gravity", "at least 3 items"]),
     ],
@@ -73,3 +73,12 @@ def test_an_impossible_value_is_refused_in_one_line(override, words):
     assert len(str(caught.value).splitlines()) == 1
     for word in words:
         assert word.removeprefix("env.") in str(caught.value)
+
+
+def test_one_number_stands_for_all_joints():
+    spec = spec_of(command_limit=1.5, damping=0.2, friction=[0.1, 0.3])
+    assert (spec.command_limit.tolist(), spec.damping.tolist(), spec.friction.tolist()) == (
+        [1.5, 1.5],
+        [0.2, 0.2],
+        [0.1, 0.3],
+    )

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from physai.robots import RobotSpec, feet, feet_at_home
+from physai.robots import RobotSpec, ends_at_home, kinematics_of
 from physai.tasks.gait import Gait
 from physai.tasks.walk import WalkObservation
 
@@ -32,8 +32,10 @@ def feet_in_time(spec, command=VELOCITY, yaw_rate=0.0, **gait):
     _, features = module(turning, zero, home, torch.zeros(rows, joints), torch.zeros(rows, joints), clock, goal)
     offset = torch.tanh(features[:, -joints:]).double().numpy() * spec.command_limit
     frames = spec.motions.frames(spec.home + offset)
-    places = np.stack([np.einsum("ijr,j->ri", frames[body], foot[:, 3]) for body, foot in feet(spec)], axis=1)
-    return places - feet_at_home(spec)[0]
+    places = np.stack(
+        [np.einsum("ijr,j->ri", frames[body], foot[:, 3]) for body, foot in kinematics_of(spec).ends], axis=1
+    )
+    return places - ends_at_home(spec)[0]
 
 
 def test_over_a_stance_a_foot_goes_back_as_far_as_the_base_goes_forward(spec):
@@ -55,7 +57,7 @@ def test_feet_of_a_diagonal_step_together_and_are_up_only_while_they_swing(spec)
 
 def test_to_turn_feet_go_around_the_base(spec):
     x, y = feet_in_time(spec, np.array([0.0, 0.0, 0.2]))[0, :, :2].T  # at the beginning of the swing of two
-    place = feet_at_home(spec)[0]
+    place = ends_at_home(spec)[0]
     way = 0.125 * 0.2 * np.array([1, -1, -1, 1])
     np.testing.assert_allclose(x, way * place[:, 1], atol=2e-4)
     np.testing.assert_allclose(y, -way * place[:, 0], atol=2e-4)
@@ -71,7 +73,7 @@ def test_feet_sway_forward_together_and_outward_to_either_side(spec):
 def test_a_turn_that_is_missing_moves_the_feet_against_it(spec):
     there = feet_in_time(spec, yaw_rate=-0.2, yaw_correction=0.1)
     without = feet_in_time(spec, yaw_rate=-0.2)
-    place = feet_at_home(spec)[0]
+    place = ends_at_home(spec)[0]
     np.testing.assert_allclose((there - without)[0, :, 1], -0.02 * place[:, 0], atol=5e-4)
 
 

@@ -1,6 +1,7 @@
 """What a robot looks like, and a goal that is dragged: without a browser."""
 
 import asyncio
+import dataclasses
 import io
 from types import SimpleNamespace
 
@@ -12,7 +13,7 @@ import trimesh
 from physai.deploy import read_metadata
 from physai.envs.simulation import Simulation
 from physai.errors import UserError
-from physai.robots import ForwardKinematics, RobotSpec
+from physai.robots import ForwardKinematics, RobotSpec, kinematics_of
 from physai.web import Appearance, GoalMarker, RobotScene, serve
 from physai.web.appearance import robot_of
 from physai.web.scene import on_the_spot
@@ -60,17 +61,20 @@ def test_a_policy_file_is_drawn_by_its_urdf_or_says_why_it_cannot_be(exported_ru
     metadata = read_metadata(exported_run / "policy.pt")
     assert Appearance.of_policy(metadata).bodies == Appearance.of_robot(robot_of(metadata)).bodies
     monkeypatch.setitem(metadata.raw["robot"], "urdf_sha256", "of another one")
-    with pytest.raises(UserError, match=r"the policy has no capsules; .*not the URDF that the policy was trained with"):
-        Appearance.of_policy(metadata)
+    told = dataclasses.replace(metadata, kinematics=None)
+    with pytest.raises(UserError, match=r"has no kinematics; .*not the URDF that the policy was trained with"):
+        Appearance.of_policy(told)
 
 
-def test_a_policy_file_whose_urdf_is_elsewhere_is_drawn_by_its_capsules(env_config):
-    spec = RobotSpec.from_config(env_config("kuka7_reach").robot)
-    metadata = SimpleNamespace(raw={"config": {}}, robot="kuka", collision=spec.collision)
-    look = Appearance.of_policy(metadata)
+@pytest.mark.parametrize("env", ["kuka7_reach", "a1_walk"])  # by capsules, and by sticks
+def test_a_policy_file_whose_urdf_is_elsewhere_is_drawn_by_what_it_tells(env_config, env):
+    spec = RobotSpec.from_config(env_config(env).robot)
+    told = {"collision": spec.collision, "kinematics": kinematics_of(spec)}
+    look = Appearance.of_policy(SimpleNamespace(raw={"config": {}}, robot="a robot", **told))
     whole = Appearance.of_robot(spec)
     assert [body is not None for body in look.bodies].count(True) >= len(spec.joints)
     assert look.frames(spec.home) == pytest.approx(whole.frames(spec.home))
+    assert (look.reach, look.floor) == (whole.reach, pytest.approx(whole.floor, abs=0.1))
 
 
 @pytest.mark.parametrize("env", ["reacher", "xarm_reach", "panda_pose"])
