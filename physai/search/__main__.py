@@ -70,7 +70,7 @@ class Search:
         try:
             if done := study.done():
                 print(f"{folder}: {done} trials are done, {max(0, settings.trials - done)} are left.", flush=True)
-            report = Report(folder, study, settings.objective)
+            report = Report(folder, study)
             run_trials(folder, study, self._config, self._fixed, report.ended)
             report.summary(self._fixed)
         except KeyboardInterrupt:

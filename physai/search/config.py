@@ -14,14 +14,9 @@ class StudyConfig(Config):
     trials: Count
     jobs: Count
     prune: bool
-    objective: Literal["success_rate", "return", "time_to_target"]
+    objective: Literal["success_rate", "time_to_target"]
     target: Annotated[float, Field(gt=0, le=1)]
     ranges: dict[str, str]
-
-    @property
-    def measure(self) -> str:
-        """What is looked at in each evaluation."""
-        return "success_rate" if self.minimize else self.objective
 
     @property
     def minimize(self) -> bool:

@@ -68,19 +68,19 @@ class _Running:
 
     def look(self) -> None:
         """Report new evaluations, and stop the run if they are worse than the median of the others' at that step."""
-        for one in trials.evaluations(self._folder, self._settings.measure):
+        for one in trials.evaluations(self._folder):
             step = one.frames // self._every_frames
-            self._reached |= self._settings.minimize and one.value >= self._settings.target
+            self._reached |= self._settings.minimize and one.success_rate >= self._settings.target
             if step > self._step:
                 self._step = step
-                self._trial.report(-one.value if self._settings.minimize else one.value, step)
+                self._trial.report(-one.success_rate if self._settings.minimize else one.success_rate, step)
                 if self._settings.prune and not (self._pruned or self._reached) and self._trial.should_prune():
                     self._pruned = True
                     self.process.terminate()
 
     def tell(self, study: Study) -> None:
         """Tell what came of it."""
-        value = trials.final(self._folder, self._settings.measure)
+        value = trials.success_rate(self._folder)
         if value is not None and self._settings.minimize:
             value = trials.time_to_target(self._folder, self._settings.target)
         error = None if value is not None or self._pruned else trials.error(self._folder, self.process.exitcode or 0)

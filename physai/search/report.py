@@ -25,12 +25,11 @@ class Report:
     Args:
         folder: The study's.
         study: It.
-        objective: What the value of a trial is, as in ``search.objective``.
     """
 
-    def __init__(self, folder: Path, study: Study, objective: str) -> None:
+    def __init__(self, folder: Path, study: Study) -> None:
         self._folder, self._study = folder, study
-        self._objective = {"time_to_target": "seconds to target"}.get(objective, objective.replace("_", " "))
+        self._objective = "seconds to target" if study.minimize else "success rate"
         self._names = _short_names(study.space)
 
     def ended(self, run: int) -> None:
@@ -78,13 +77,10 @@ class Report:
 
 
 def _short_names(keys: Iterable[str]) -> dict[str, str]:
-    """As many of the last words of each key as no other ends with."""
+    """The last word of each key, or all of it where two have the same."""
     keys = sorted(keys)
-    ends = {key: [".".join(key.split(".")[-words:]) for words in range(1, key.count(".") + 2)] for key in keys}
-    return {
-        key: next((end for end in ends[key] if not any(end in ends[other] for other in keys if other != key)), key)
-        for key in keys
-    }
+    last = [key.rpartition(".")[2] for key in keys]
+    return {key: name if last.count(name) == 1 else key for key, name in zip(keys, last, strict=True)}
 
 
 def _short(value: Any) -> str:

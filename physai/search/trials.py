@@ -23,11 +23,11 @@ _CONTEXT.set_forkserver_preload(["physai.training.run"])
 
 
 class Evaluation(NamedTuple):
-    """What was measured in an evaluation while a run trains."""
+    """An evaluation while a run trains."""
 
     frames: int
     seconds: float
-    value: float
+    success_rate: float
 
 
 def start(folder: Path, overrides: Sequence[str]) -> BaseProcess:
@@ -50,26 +50,26 @@ def error(folder: Path, code: int) -> str:
     return next((line.removeprefix("error: ") for line in reversed(lines) if line.strip()), f"exit code {code}")
 
 
-def evaluations(folder: Path, measure: str) -> list[Evaluation]:
-    """Read the evaluations of a run so far: what they measured of what has this name."""
+def evaluations(folder: Path) -> list[Evaluation]:
+    """Read the evaluations of a run so far."""
     try:
         lines = (folder / "metrics.csv").read_text().splitlines(keepends=True)
     except FileNotFoundError:
         return []
     rows = csv.DictReader(line for line in lines if line.endswith("\n"))  # the last is perhaps being written
-    keys = ("frames", "time/seconds", f"evaluation/{measure}")
+    keys = ("frames", "time/seconds", "evaluation/success_rate")
     return [Evaluation(int(row[keys[0]]), float(row[keys[1]]), float(row[keys[2]])) for row in rows if row[keys[2]]]
 
 
-def final(folder: Path, measure: str) -> float | None:
-    """What the final evaluation measured of that name; None if the run did not come to its end."""
+def success_rate(folder: Path) -> float | None:
+    """The success rate of the final evaluation; None if the run did not come to its end."""
     path = folder / "summary.json"
-    return float(json.loads(path.read_text())[measure]) if path.is_file() else None
+    return float(json.loads(path.read_text())["success_rate"]) if path.is_file() else None
 
 
 def time_to_target(folder: Path, target: float) -> float:
     """Seconds of training until an evaluation first had a success rate; infinity if none has."""
-    return next((one.seconds for one in evaluations(folder, "success_rate") if one.value >= target), math.inf)
+    return next((one.seconds for one in evaluations(folder) if one.success_rate >= target), math.inf)
 
 
 def _run(starter: int, home: Path, folder: Path, overrides: list[str]) -> None:

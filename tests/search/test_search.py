@@ -110,7 +110,6 @@ def wait_until(condition, process, seconds=240):
 def test_a_killed_search_goes_on_redoes_nothing_and_tries_what_it_would_have_tried(run, tmp_path):
     ranges = {"algo.optimizer.lr": "interval(1e-3,1e-2)"}
     arguments = (*(f"{key}={text}" for key, text in ranges.items()), "search.trials=4", "search.jobs=2")
-    arguments += ("search.objective=return",)
     folder = tmp_path / "search"
     process = command("search", *OVERRIDES, *arguments, cwd=tmp_path)
     wait_until(lambda: summaries(folder) and len(list(folder.glob("[123]/metrics.csv"))), process)
@@ -127,8 +126,6 @@ def test_a_killed_search_goes_on_redoes_nothing_and_tries_what_it_would_have_tri
     expected = [study.ask()[1].params["algo.optimizer.lr"] for _ in range(4)]
     study.close()
     assert [float(trial["algo.optimizer.lr"]) for trial in table(folder)] == expected
-    for trial in table(folder):
-        assert float(trial["return"]) == json.loads(after[trial["run"]])["return"]
 
 
 @pytest.mark.parametrize(
@@ -139,7 +136,7 @@ def test_a_killed_search_goes_on_redoes_nothing_and_tries_what_it_would_have_tri
         (["algo.epochs=interval(3,1)"], "algo.epochs=interval(3,1): `low <= high` must hold"),
         (["algo.epochs=choice(1,-1)"], "algo.epochs: input should be greater than 0, got -1"),
         (["algo.epoch=choice(1,2)"], "unknown key 'algo.epoch'; did you mean 'algo.epochs'?"),
-        (["search.objective=reward", "seed=0,1"], "search.objective: input should be 'success_rate'"),
+        (["search.objective=return", "seed=0,1"], "search.objective: input should be 'success_rate'"),
         (["search.target=2", "seed=0,1"], "search.target: input should be less than or equal to 1"),
         (["search.trial=2", "seed=0,1"], "unknown key 'search.trial'; did you mean 'search.trials'?"),
     ],

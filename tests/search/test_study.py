@@ -3,7 +3,6 @@
 import contextlib
 import math
 import os
-import re
 
 import pytest
 
@@ -165,7 +164,7 @@ def test_trials_without_a_value_are_in_the_report_and_do_not_win(tmp_path, capsy
         pruned = study.ask()[1]
         pruned.report(-0.9, 1)
         study.tell(pruned)
-        report = Report(tmp_path, study, "time_to_target")
+        report = Report(tmp_path, study)
         report.ended(4)
         report.summary(["threads=1"])
         best = study.trials()[2].params
@@ -179,20 +178,10 @@ def test_trials_without_a_value_are_in_the_report_and_do_not_win(tmp_path, capsy
     assert (tmp_path / "study.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_names_are_as_short_as_they_can_be_told_apart(tmp_path, capsys):
-    space = make_space(dict.fromkeys(("lr", "algo.epochs", "gait.up.begin", "gait.aside.begin", "a.lr"), "choice(1,2)"))
-    with opened(tmp_path, space=space) as study:
-        study.tell(study.ask()[1], 0.5)
-        Report(tmp_path, study, "return").ended(0)
-    output = capsys.readouterr().out
-    assert output.startswith("[0] return 0.5  (")
-    assert sorted(re.findall(r"([\w.]+)=", output)) == ["a.lr", "aside.begin", "epochs", "lr", "up.begin"]
-
-
 def test_a_search_whose_trials_all_fail_ends_in_one_line_and_exit_code_1(tmp_path, capsys):
     with opened(tmp_path) as study:
         study.tell(study.ask()[1], error="the loss is not finite")
         with pytest.raises(SystemExit) as stop:
-            Report(tmp_path, study, "success_rate").summary([])
+            Report(tmp_path, study).summary([])
     assert stop.value.code == 1
     assert capsys.readouterr().err == "error: none of 1 trials came to an end; the output.txt of each says why\n"
