@@ -25,7 +25,7 @@ if __name__ == "__main__":
 """
 
 
-@pytest.mark.slow
+@pytest.mark.realtime
 def test_an_arm_is_driven_and_stopped(exported_run, tmp_path):
     """Half a minute, in a process of its own, which forks the nodes."""
     (tmp_path / "measure.py").write_text(SCRIPT)

@@ -9,7 +9,7 @@ from physai.bench import ros
 from tests.ros.peer import free_domain
 
 
-@pytest.mark.slow
+@pytest.mark.realtime
 def test_both_nodes_are_timed_and_shown(exported_run, monkeypatch):
     monkeypatch.setattr(ros, "make_run", lambda run, *_: shutil.copytree(exported_run, run, dirs_exist_ok=True))
     monkeypatch.setattr(ros, "PERIOD_SECONDS", 2.0)

@@ -5,17 +5,17 @@ import re
 import pytest
 import yaml
 
-from physai.compose import compose, conf_dir
+from physai.compose import compose
 from physai.config import validate
 from physai.deploy import State
 from physai.errors import UserError
 from physai.training.config import TrainConfig
-from tests.docs.blocks import FILES, PAGES, ROOT, Block, blocks, commands, hooks, prose
+from tests.docs.blocks import FILES, PAGES, ROOT, Block, blocks, commands, hooks, prose, shown_files
 from tests.docs.command_lines import SOURCES, check, exists, parameter_class
 from tests.docs.test_cpp import COMPILER
-from tests.test_contributing import EXAMPLE
 
 HOOKS = hooks()
+EXAMPLES = shown_files("CONTRIBUTING.md") | shown_files("docs/walk.md")
 BROUGHT = ("collector", "env", "experiment", "logger", "policy", "randomization")
 CONSOLE = {block.text.splitlines()[0]: block for block in blocks("console")}
 
@@ -29,12 +29,11 @@ def test_each_command_exists_and_takes_what_it_is_given(block):
 
 def test_each_block_is_of_a_language_that_a_test_looks_at():
     tested = {"python", "bash", "console", "yaml", "mermaid", "text"}
-    examples = [match[2] for match in EXAMPLE.finditer((ROOT / "CONTRIBUTING.md").read_text())]
     for block in blocks():
-        assert block.language in tested or block.text in examples, block
+        assert block.language in tested or block.text in EXAMPLES.values(), block
 
 
-@pytest.mark.parametrize("block", [block for block in blocks("yaml") if block.page != "CONTRIBUTING.md"], ids=str)
+@pytest.mark.parametrize("block", [block for block in blocks("yaml") if block.text not in EXAMPLES.values()], ids=str)
 def test_each_parameter_file_is_accepted(block):
     for node, values in yaml.safe_load(block.text).items():
         parameter_class(node)(**values["ros__parameters"])
@@ -93,14 +92,14 @@ def test_topics_services_and_choices_in_the_text_exist(path):
             assert exists(name), name
         for group, choice in re.findall(r"\b(\w+)=(\w+)", name):
             if group in BROUGHT:
-                shown_there = f"`conf/{group}/{choice}.yaml`" in (ROOT / "CONTRIBUTING.md").read_text()
-                assert shown_there or (conf_dir() / group / f"{choice}.yaml").is_file(), name
+                file = f"conf/{group}/{choice}.yaml"
+                assert file in EXAMPLES or (ROOT / file).is_file(), name
 
 
 def test_files_of_the_project_in_the_text_exist():
     for path in PAGES:
         for name in re.findall(r"`((?:physai|conf|docs|tests)/[\w/.]+)`", prose(path)):
-            assert (ROOT / name).exists(), f"{path}: {name}"
+            assert name in EXAMPLES or (ROOT / name).exists(), f"{path}: {name}"
 
 
 def test_sources_are_read():
