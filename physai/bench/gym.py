@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from rich.table import Table
 
 from physai.bench.timing import median_speeds, reacher, table
+from physai.config import of_each
 from physai.envs.simulation import EnvConfig
 from physai.robots import RobotSpec
 
@@ -46,7 +47,8 @@ class HandWrittenReacher(gymnasium.Env[Array, Array]):
         self.efforts = spec.effort_limit.tolist()
         self.limits, self.max_steps = spec.command_limit.tolist(), config.task["max_steps"]
         self.tolerance, self.success_reward = config.task["tolerance"], config.task["success_reward"]
-        self.radius, self.spread = config.task["goal_radius"], config.start.spread
+        self.radius = config.task["goal_radius"]
+        self.spread = of_each(config.start.spread, len(spec.joints), "env.start.spread")
         self.observation_space = spaces.Box(-np.inf, np.inf, (8,), np.float32)
         self.action_space = spaces.Box(-1.0, 1.0, (2,), np.float32)
 

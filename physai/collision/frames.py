@@ -1,6 +1,7 @@
-"""Where the bodies of a robot are: the forward kinematics of all of them, in NumPy."""
+"""Where the bodies of a robot are, and where its links end: the forward kinematics of all of them, in NumPy."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -70,3 +71,34 @@ class Motions:
         for carrier, moved, after in zip(self.carriers, motion, frames[1:], strict=True):
             np.add.reduce(frames[carrier][:, :, np.newaxis] * moved, axis=1, out=after)
         return frames
+
+
+@dataclass(frozen=True, eq=False)
+class Kinematics:
+    """What each joint of a robot moves, and where its links end.
+
+    Attributes:
+        motions: Of the n joints.
+        ends: Places where links end without a joint, each the number of a body and its frame there, 4 x 4: of an arm
+            the end effector, of legs the feet.
+        height: Of the base above the floor while a robot on legs stands at home, m; 0 of arms.
+    """
+
+    motions: Motions
+    ends: tuple[tuple[int, np.ndarray], ...]
+    height: float = 0.0
+
+    def places(self, joint_position: np.ndarray) -> np.ndarray:
+        """Return where the e ends are at joint positions [N, n], rad, in the base's frame, m, [e, 3, N]."""
+        frames = self.motions.frames(joint_position)
+        return np.stack([np.einsum("ijr,j->ir", frames[body], end[:, 3]) for body, end in self.ends])
+
+    def describe(self) -> dict[str, Any]:
+        """Return it as JSON holds it."""
+        return {
+            **{key: getattr(self.motions, key).tolist() for key in ("constant", "cosine", "sine")},
+            "carriers": list(self.motions.carriers),
+            "end_carriers": [body for body, _ in self.ends],
+            "ends": [frame.tolist() for _, frame in self.ends],
+            "height": self.height,
+        }

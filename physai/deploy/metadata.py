@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from physai.collision import CollisionModel
-from physai.deploy.kinematics import Kinematics
+from physai.collision import CollisionModel, Kinematics
+from physai.deploy.kinematics import read_kinematics
 from physai.deploy.reading import PolicyError, all_numbers, array, get, items, positive
 from physai.signals import Quantity, Region, Signal, Tolerance
 from physai.signals.region import REGIONS
@@ -55,7 +55,7 @@ class Metadata:
         outputs: What it gives, in order; first the command.
         region: Where goals lie.
         tolerances: Errors that count as reached, one for each error that the policy tells.
-        kinematics: What each joint moves; None in files that do not tell.
+        kinematics: What each joint moves, and where the links end.
         collision: The robot's capsules, and what it was trained not to touch; None where it has none.
         golden: Inputs, and the outputs and errors that the policy gave for them when it was exported, by name; float32,
             [pairs, ...].
@@ -76,7 +76,7 @@ class Metadata:
     outputs: tuple[Signal, ...]
     region: Region
     tolerances: tuple[Tolerance, ...]
-    kinematics: Kinematics | None
+    kinematics: Kinematics
     collision: CollisionModel | None
     golden: dict[str, np.ndarray]
     content_sha256: str
@@ -154,7 +154,7 @@ class Metadata:
             outputs=outputs,
             region=region,
             tolerances=tolerances,
-            kinematics=Kinematics.read(raw, n),
+            kinematics=read_kinematics(raw, n),
             collision=_collision(raw, n),
             golden={key: array(raw, f"golden.{key}", shape, kind=np.float32) for key, shape in shapes.items()},
             content_sha256=get(raw, "content_sha256", str),

@@ -114,8 +114,7 @@ class InferenceNode(StoppableNode[InferenceConfig]):
             self._emergency_stop("before this start")
         else:
             self._announce()
-        if (urdf := description.urdf(policy.metadata, self._frames())) is not None:
-            self._descriptions.publish(String(data=urdf))
+        self._descriptions.publish(String(data=description.urdf(policy.metadata, self._frames())))
         self._asked.publish(String(data=describe_goal(policy.metadata)))
         self.get_logger().info(
             f"{config.policy_path} drives {list(policy.metadata.joints)} of '{policy.metadata.robot}'"

@@ -1,6 +1,6 @@
 """Walk: follow a velocity on legs, without a fall."""
 
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any
 
 import numpy as np
 import torch
@@ -8,7 +8,7 @@ from omegaconf import OmegaConf
 from pydantic import Field
 from torch import Tensor
 
-from physai.config import Config, Count, NonNegativeFloat, PositiveFloat, validate
+from physai.config import C, Config, Count, NonNegativeFloat, PositiveFloat, validate
 from physai.errors import UserError
 from physai.physics import RobotState
 from physai.physics.rotation import rotate_back
@@ -19,7 +19,6 @@ from physai.tasks.interface import ObservationModule, Step, Task
 
 _STILL = 0.05  # m/s and rad/s: a command below it asks to stand
 
-C = TypeVar("C", bound=Config)
 Vector = Annotated[list[float], Field(min_length=3, max_length=3)]
 
 
@@ -45,14 +44,14 @@ class WalkObservation(ObservationModule):
         self.frequency, self.still, self.period = gait.frequency, _STILL, 1.0 / gait.frequency
         self.home: Tensor
         self.phase: Tensor
-        self.lift: Tensor
+        self.swing: Tensor
         self.sway: Tensor
         self.stride: Tensor
         self.yaw_correction: Tensor
         self.register_buffer("home", torch.from_numpy(spec.home).float())
         of_joints = joint_gait(gait, spec)
         self.register_buffer("phase", torch.from_numpy(of_joints.phase).float())
-        for name in ("lift", "sway", "stride", "yaw_correction"):  # as actions
+        for name in ("swing", "sway", "stride", "yaw_correction"):  # as actions
             self.register_buffer(name, torch.from_numpy(getattr(of_joints, name) / spec.command_limit).float())
 
     def forward(  # type: ignore[override]
@@ -74,7 +73,7 @@ class WalkObservation(ObservationModule):
         turn = 2.0 * torch.pi * (self.frequency * clock + self.phase)
         sine, cosine = torch.sin(turn), torch.cos(turn)
         moves = (goal.abs().amax(dim=1, keepdim=True) > self.still).to(goal.dtype)
-        way = self.lift * torch.relu(sine) + self.sway[0] * cosine + self.sway[1] * sine + goal @ self.stride * cosine
+        way = self.swing * torch.relu(sine) + self.sway[0] * cosine + self.sway[1] * sine + goal @ self.stride * cosine
         way = way + self.yaw_correction * (goal[:, 2:] - angular_velocity[:, 2:])
         suggested = torch.atanh(torch.clamp(moves * way, -0.95, 0.95))
         now = 2.0 * torch.pi * self.frequency * clock
@@ -163,11 +162,10 @@ class Walk(Task):
         self._commands, self._stand = Box(tuple(low), tuple(high)), stand
         self.goal = Signal("goal", Quantity.TWIST, (3,), *ends, ("vx", "vy", "yaw_rate"), spec.base)
         self.tolerances = Tolerance("velocity", "m/s", tolerance), Tolerance("yaw_rate", "rad/s", yaw_rate_tolerance)
-        self.module = WalkObservation(spec, _checked(Gait, gait, "env.task.gait."))
+        self.module = WalkObservation(spec, _checked(Gait, gait, "env.task.gait"))
         self.observation = _observation(spec, self.goal)
-        self._reward = _checked(WalkRewards, reward, "env.task.reward.")
+        self._reward = _checked(WalkRewards, reward, "env.task.reward")
         self._home, self._height, self._effort = spec.home, spec.floating.height, spec.effort_limit
-        self._feet = list(spec.floating.feet)
         self._others = [link for link in range(len(spec.floating.links)) if link not in spec.floating.feet]
         self._upright, self._lowest, self._dt = np.cos(lean), lowest * spec.floating.height, control_dt
 
@@ -224,7 +222,11 @@ class Walk(Task):
 
 def _checked(model: type[C], part: C | dict[str, Any], where: str) -> C:
     """Return a part of a config as its model, which it may be already."""
-    return part if isinstance(part, model) else validate(model, OmegaConf.create(part), where)
+    if isinstance(part, model):
+        return part
+    if not isinstance(part, dict):
+        raise UserError(f"{where}: keys and values are needed, got {part!r}")
+    return validate(model, OmegaConf.create(part), f"{where}.")
 
 
 def _in_heading(state: RobotState) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -2,16 +2,16 @@
 
 import hashlib
 from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
 import trimesh
 from omegaconf import DictConfig
 
-from physai.collision import Capsule, CollisionModel, Motions
+from physai.collision import Capsule, CollisionModel, Kinematics
 from physai.config import validate
 from physai.deploy import Metadata
-from physai.deploy.kinematics import Kinematics
 from physai.errors import UserError
 from physai.robots import RobotConfig, RobotSpec, kinematics_of
 from physai.robots.visuals import plain, visual_bodies
@@ -25,19 +25,17 @@ class Appearance:
     """A robot to draw; many scenes of robots of one kind may share it.
 
     Attributes:
-        motions: What each driven joint moves.
+        kinematics: What each driven joint moves, and where the links end.
         bodies: glTF binaries of n + 1 bodies in their frames: of the base, then of what each driven joint moves; None
             where nothing is seen.
         reach: Length of the stretched robot, m; of legs, from the middle of the base on.
         floor: The lowest point of a fixed base, m; zero or below.
-        tip: The end effector's frame in that of the last body, 4 x 4; None where nobody has told.
     """
 
-    motions: Motions
+    kinematics: Kinematics
     bodies: tuple[bytes | None, ...]
     reach: float
     floor: float
-    tip: np.ndarray | None
 
     @classmethod
     def of_robot(cls, spec: RobotSpec) -> "Appearance":
@@ -53,19 +51,11 @@ class Appearance:
 
     @classmethod
     def of_policy(cls, metadata: Metadata) -> "Appearance":
-        """Draw the robot of a policy file: by its URDF, if it is here and the same, else by what the file tells.
-
-        Raises:
-            UserError: If the URDF is not here, and the file does not tell what the joints move.
-        """
-        try:
+        """Draw the robot of a policy file: by its URDF, if it is here and the same, else by what the file tells."""
+        with suppress(UserError):  # it is not here
             spec = robot_of(metadata)
-            if hashlib.sha256(spec.urdf.read_bytes()).hexdigest() != metadata.raw["robot"]["urdf_sha256"]:
-                raise UserError(f"{spec.urdf}: not the URDF that the policy was trained with")
-            return cls.of_robot(spec)
-        except UserError as error:
-            if metadata.kinematics is None:
-                raise UserError(f"'{metadata.robot}' cannot be drawn: the policy has no kinematics; {error}") from error
+            if hashlib.sha256(spec.urdf.read_bytes()).hexdigest() == metadata.raw["robot"]["urdf_sha256"]:
+                return cls.of_robot(spec)
         return cls.of_shapes(metadata.kinematics, _of_model(metadata.collision) if metadata.collision else [])
 
     @classmethod
@@ -80,21 +70,23 @@ class Appearance:
             meshes = _sticks(kinematics)
         floor = min((float(mesh.bounds[0, 2]) for mesh in meshes[0]), default=0.0)
         bodies, reach = tuple(_gltf(each) for each in meshes), _reach(kinematics)
-        tip = kinematics.ends[0][1] if len(kinematics.ends) == 1 else None
-        return cls(kinematics.motions, bodies, reach, 0.0 if kinematics.height else min(floor, 0.0), tip)
+        return cls(kinematics, bodies, reach, 0.0 if kinematics.height else min(floor, 0.0))
 
     @property
     def joints(self) -> int:
         """How many joints it draws, n."""
-        return len(self.motions)
+        return len(self.kinematics.motions)
 
     def frames(self, joint_position: np.ndarray) -> np.ndarray:
         """Return the frame of each body at joint positions [n], rad, in the base's: [n + 1, 3, 4]."""
-        return self.motions.frames(np.asarray(joint_position, dtype=np.float64)[np.newaxis])[..., 0]
+        return self.kinematics.motions.frames(np.asarray(joint_position, dtype=np.float64)[np.newaxis])[..., 0]
 
     def tip_position(self, joint_position: np.ndarray) -> np.ndarray | None:
-        """Return where the end effector is at joint positions [n], rad, in the base's frame, m, [3]."""
-        return None if self.tip is None else self.frames(joint_position)[-1] @ self.tip[:, 3]
+        """Return where the end effector is at joint positions [n], rad, in the base's frame, m, [3]; None of legs."""
+        if self.kinematics.height or len(self.kinematics.ends) != 1:
+            return None
+        place: np.ndarray = self.kinematics.places(np.asarray(joint_position, np.float64)[np.newaxis])[0, :, 0]
+        return place
 
 
 def robot_of(metadata: Metadata) -> RobotSpec:

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from urdf_parser_py.urdf import Joint, Robot
 
-from physai.deploy.kinematics import Kinematics
+from physai.collision import Kinematics
 from physai.errors import UserError
 from physai.robots.chain import carried, motions
 from physai.robots.urdf import load

@@ -5,6 +5,7 @@ import json
 import numpy as np
 import torch
 
+from physai.collision import Kinematics, Motions
 from physai.deploy.archive import content_sha256
 from physai.deploy.metadata import FORMAT, FORMAT_VERSION, describe_region, describe_signal, metadata_sha256
 from physai.signals import Quantity, Signal
@@ -17,6 +18,16 @@ PAIRS = 4
 def of_joints(name, quantity, joints):
     most = np.full(len(joints), 3.0)
     return Signal.of_joints(name, Quantity(quantity), joints, -most, most)
+
+
+def _in_a_row(joints: int) -> Kinematics:
+    """Joints that turn about z, 0.3 m from each other along x."""
+    constant, cosine, sine = np.zeros((3, joints, 4, 4))
+    constant[:] = np.diag([0.0, 0.0, 1.0, 1.0])
+    constant[:, 0, 3] = 0.3
+    cosine[:] = np.diag([1.0, 1.0, 0.0, 0.0])
+    sine[:, 1, 0], sine[:, 0, 1] = 1.0, -1.0
+    return Kinematics(Motions(constant, cosine, sine), ((joints, np.eye(4)),))
 
 
 def policy_file(module, joints, inputs, outputs, region, tolerances, collision=None, home=None) -> bytes:
@@ -42,6 +53,7 @@ def policy_file(module, joints, inputs, outputs, region, tolerances, collision=N
             "region": describe_region(region),
             "tolerances": [{"name": one.name, "unit": one.unit, "value": one.value} for one in tolerances],
         },
+        "kinematics": _in_a_row(n).describe(),
         "collision": None if collision is None else collision.describe(),
         "golden": {name: value.tolist() for name, value in golden.items()},
         "content_sha256": content_sha256(save(scripted)),

@@ -271,7 +271,7 @@ def test_there_are_golden_pairs_and_all_are_complete(good):
 @pytest.mark.parametrize("version", [0, 1, "2", None, [2], {}, -1, 1e300], ids=repr)
 def test_another_format_version_is_named_and_how_to_mend_it(good, version):
     message = refusal(changed(good, "format_version", version))
-    assert f"format version {version!r}; this physai reads 3: export the policy again" in message
+    assert f"format version {version!r}; this physai reads 4: export the policy again" in message
     assert "format version None" in refusal(changed(good, "format_version", ...))
 
 

@@ -4,11 +4,12 @@ import numpy as np
 import pytest
 import torch
 
+from physai.errors import UserError
 from physai.robots import RobotSpec, ends_at_home, kinematics_of
-from physai.tasks.gait import Gait
+from physai.tasks.gait import Gait, joint_gait
 from physai.tasks.walk import WalkObservation
 
-STILL = {"begin": 0.0, "middle": 0.0}
+STILL = {"start": 0.0, "middle": 0.0}
 GAIT = {"frequency": 2.0, "lift": 0.0, "reach": 0.0, "forward": STILL, "outward": STILL, "stride": 1.0}
 GAIT["yaw_correction"] = 0.0
 VELOCITY = np.array([0.06, 0.0, 0.0])  # m/s: small enough for a Jacobian
@@ -31,10 +32,7 @@ def feet_in_time(spec, command=VELOCITY, yaw_rate=0.0, **gait):
     goal = torch.from_numpy(command).float().expand(rows, 3)
     _, features = module(turning, zero, home, torch.zeros(rows, joints), torch.zeros(rows, joints), clock, goal)
     offset = torch.tanh(features[:, -joints:]).double().numpy() * spec.command_limit
-    frames = spec.motions.frames(spec.home + offset)
-    places = np.stack(
-        [np.einsum("ijr,j->ri", frames[body], foot[:, 3]) for body, foot in kinematics_of(spec).ends], axis=1
-    )
+    places = kinematics_of(spec).places(spec.home + offset).transpose(2, 0, 1)
     return places - ends_at_home(spec)[0]
 
 
@@ -64,9 +62,9 @@ def test_to_turn_feet_go_around_the_base(spec):
 
 
 def test_feet_sway_forward_together_and_outward_to_either_side(spec):
-    moved = feet_in_time(spec, forward={"begin": 0.0, "middle": 0.01}, stride=1e-6)
+    moved = feet_in_time(spec, forward={"start": 0.0, "middle": 0.01}, stride=1e-6)
     assert moved[6, :, 0] == pytest.approx([0.01, -0.01, -0.01, 0.01], abs=1e-3)
-    moved = feet_in_time(spec, outward={"begin": 0.01, "middle": 0.0}, stride=1e-6)
+    moved = feet_in_time(spec, outward={"start": 0.01, "middle": 0.0}, stride=1e-6)
     assert moved[0, :, 1] == pytest.approx([-0.01, -0.01, 0.01, 0.01], abs=1e-3)
 
 
@@ -79,3 +77,40 @@ def test_a_turn_that_is_missing_moves_the_feet_against_it(spec):
 
 def test_where_it_shall_stand_nothing_moves(spec):
     assert np.abs(feet_in_time(spec, np.zeros(3), lift=0.1)).max() < 1e-6
+
+
+def stretched(config, knee):
+    return {"home": [0.0, 0.0, knee] * 4}
+
+
+def on_one_line(config, _):
+    return {"floating": config.floating.model_copy(update={"feet": ["FR_toe", "FR_lower", "RL_toe", "RL_lower"]})}
+
+
+def two(config, _):
+    return {"floating": config.floating.model_copy(update={"feet": ["FR_toe", "FL_toe"]})}
+
+
+@pytest.mark.parametrize(
+    ("change", "knee", "line"),
+    [
+        (stretched, 0.0, "its legs are too straight to lift the feet: bend the knees in 'home'"),
+        (stretched, -0.1, "its legs are too straight to lift the feet: bend the knees in 'home'"),
+        (on_one_line, None, "a trot needs four feet, one at each corner, with a leg of its own"),
+        (two, None, "a trot needs four feet, one at each corner, with a leg of its own"),
+    ],
+)
+def test_legs_that_cannot_trot_are_refused_in_one_line(env_config, change, knee, line):
+    config = env_config("a1_walk").robot
+    spec = RobotSpec.from_config(config.model_copy(update=change(config, knee)))
+    with pytest.raises(UserError, match=f"robot 'a1': {line}"):
+        WalkObservation(spec, Gait.model_validate(GAIT | {"lift": 0.1}))
+
+
+def test_a_foot_of_two_spheres_is_one_foot(env_config, spec):
+    config = env_config("a1_walk").robot
+    heel = [sphere.model_copy(update={"center": [-0.05, 0.0, 0.0]}) for sphere in config.floating.spheres[:4]]
+    floating = config.floating.model_copy(update={"spheres": [*config.floating.spheres, *heel]})
+    more = RobotSpec.from_config(config.model_copy(update={"floating": floating}))
+    gait = Gait.model_validate(GAIT)
+    np.testing.assert_array_equal(joint_gait(gait, more).phase, joint_gait(gait, spec).phase)

@@ -145,6 +145,7 @@ def test_the_module_says_what_the_policy_sees_in_both_engines_and_scripts(simula
         (("env.task.gait.lift=-0.1",), r"^env.task.gait.lift: input should be greater than or equal to 0, got -0.1"),
         (("env.task.reward.fall=-1.0",), r"^env.task.reward.fall: input should be greater than or equal to 0, got -1"),
         (("+env.task.gait.phases=1",), r"^unknown key 'env.task.gait.phases'"),
+        (("env.task.gait=3",), r"^env.task.gait: keys and values are needed, got 3"),
         (("env.start.carried_over=0.5",), "env.start.carried_over: a robot whose base floats may have fallen"),
         (("robot@env.robot=planar_arm", "env.start.spread=[0,0]"), "'planar_arm' does not walk: its base is fixed"),
     ],

@@ -16,7 +16,7 @@ _THINNEST = 0.01  # m
 _COLOR = "0.95 0.45 0.12 1"
 
 
-def urdf(metadata: Metadata, prefix: str) -> str | None:
+def urdf(metadata: Metadata, prefix: str) -> str:
     """Describe the robot of a policy; tools that know URDFs and joint states can draw it.
 
     Links look like the capsules of the policy file, or like sticks from joint to joint where it has none. Legs stand on
@@ -27,10 +27,8 @@ def urdf(metadata: Metadata, prefix: str) -> str | None:
         prefix: Of the names of links, so that several robots have frames of their own; empty for none.
 
     Returns:
-        XML; None of a policy file that does not tell its kinematics.
+        XML.
     """
-    if metadata.kinematics is None:
-        return None
     motions, ends = metadata.kinematics.motions, metadata.kinematics.ends
     places = motions.constant + motions.cosine  # of joints at zero, in the frame before
     bodies = [prefix + name for name in (metadata.goal.frame or "base", *(f"{j}_body" for j in metadata.joints))]
