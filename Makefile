@@ -57,7 +57,8 @@ chromium:
 test: $(VENV)/.installed-dev chromium  ## Run all tests (ARGS="-m 'not slow'" for the quick ones)
 	@export PHYSAI_TEST_RUNS=$$(mktemp -d); trap 'rm -rf "$$PHYSAI_TEST_RUNS"' EXIT; \
 	part() { echo "==> Testing $$1"; shift; $(BIN)/python -m pytest "$$@" $(ARGS) || [ $$? = 5 ]; }; \
-	part "all that does not measure time: ROS 2 nodes wait while others compute" -n 4 --dist worksteal --realtime=without && \
+	part "what is not ROS" -n 3 --dist worksteal --ignore tests/ros --realtime=without && \
+	part "ROS 2 nodes, which mostly wait, side by side" tests/ros -n 3 --dist worksteal --realtime=without && \
 	part "what measures time, two at a time and nothing else" tests/ros tests/bench -n 2 --dist worksteal --realtime=only
 
 bench: $(VENV)/.installed-dev  ## Measure speed against bare PyBullet, rclpy and Stable-Baselines3
