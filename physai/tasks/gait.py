@@ -86,7 +86,7 @@ def joint_gait(gait: Gait, spec: RobotSpec) -> JointGait:
     ]
     led = np.linalg.pinv(jacobian.reshape(-1, len(spec.joints))) @ np.reshape(paths, (len(paths), -1)).T  # [n, 7]
     lifted = jacobian[:, 2] @ led[:, 0]
-    if np.abs(led[:, 0]).max() > np.pi / 2 or np.abs(lifted - gait.lift).max() > 0.1 * gait.lift:
+    if np.abs(led[:, 0]).max() > np.pi / 2 or np.abs(lifted - gait.lift).max() > 0.1 * gait.lift + 1e-6:
         raise UserError(f"robot '{spec.name}': its legs are too straight to lift the feet: bend the knees in 'home'")
     foot = moved.argmax(axis=0)  # of each joint, [n]
     return JointGait(np.where(ahead * aside > 0, 0.5, 0.0)[foot], led[:, 0], led[:, 1:3].T, led[:, 3:6].T, led[:, 6])

@@ -107,6 +107,11 @@ def test_legs_that_cannot_trot_are_refused_in_one_line(env_config, change, knee,
         WalkObservation(spec, Gait.model_validate(GAIT | {"lift": 0.1}))
 
 
+def test_feet_may_slide_without_being_lifted(spec):
+    moved = feet_in_time(spec, reach=0.03)
+    assert np.abs(moved[:, :, 2]).max() < 5e-3
+
+
 def test_a_foot_of_two_spheres_is_one_foot(env_config, spec):
     config = env_config("a1_walk").robot
     heel = [sphere.model_copy(update={"center": [-0.05, 0.0, 0.0]}) for sphere in config.floating.spheres[:4]]
