@@ -67,6 +67,11 @@ class EnvConfig(Config):
         """Whether there can be many of its robots, which are put anywhere and given other dynamics."""
         return bool(find(self.physics["_target_"]).simulated)
 
+    @property
+    def ignored(self) -> tuple[str, ...]:
+        """What its engine leaves as the robot's description says (:attr:`physai.physics.Physics.ignores`)."""
+        return tuple(getattr(find(self.physics["_target_"]), "ignores", ()))
+
 
 class Simulation:
     """Robots, physics and task, batched; rows are robots and episodes run independently in each.
@@ -108,7 +113,7 @@ class Simulation:
         self._kinematics = ForwardKinematics(self.spec) if self.spec.end_effector else None
         if self._kinematics is None and getattr(find(config.task["_target_"]), "needs_end_effector", False):
             raise UserError(f"robot '{self.spec.name}' has no end effector, which env.task needs")
-        self.layout = ParameterLayout(self.spec)
+        self.layout = ParameterLayout(self.spec, config.ignored)
         self.joint_command = JointCommand(self.spec, config.control_dt)
         self.task: Task = make("env.task", config.task, self.spec, self._kinematics, needs=_TASK)
         self._simulated = config.simulated

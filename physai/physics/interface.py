@@ -16,7 +16,8 @@ one a joint of ``joint_damping`` (N·m·s/rad), ``joint_friction`` (N·m), ``eff
 substeps, a gain g is a motor with the time constant (1 - g) / g, in control periods).
 
 Joints that are springs have, in the place of that gain, ``stiffness`` (N·m/rad) and ``servo_damping`` (N·m·s/rad). A
-robot whose base floats has ``floor_friction`` (a coefficient, 1)."""
+robot whose base floats has ``floor_friction`` (a coefficient, 1) and ``center_of_mass`` (of the base: how far it is
+from where the description has it, m, in the base's frame, 3)."""
 
 
 def nominal_dynamics(spec: RobotSpec) -> DynamicsParameters:
@@ -33,7 +34,7 @@ def nominal_dynamics(spec: RobotSpec) -> DynamicsParameters:
     else:
         nominal |= {"stiffness": spec.servo.stiffness[None], "servo_damping": spec.servo.damping[None]}
     if spec.floating is not None:
-        nominal["floor_friction"] = np.full((1, 1), spec.floating.friction)
+        nominal |= {"floor_friction": np.full((1, 1), spec.floating.friction), "center_of_mass": np.zeros((1, 3))}
     return nominal
 
 
@@ -98,9 +99,11 @@ class Physics(Protocol):
     Attributes:
         simulated: Whether N is free, and robots can be put into any state and given other dynamics. What is not
             simulated may refuse all of this with a UserError.
+        ignores: Dynamics parameters that it leaves as described, whatever it is given.
     """
 
     simulated: ClassVar[bool]
+    ignores: ClassVar[tuple[str, ...]] = ()
     num_robots: int
 
     def reset(self, rows: np.ndarray, state: RobotState, parameters: DynamicsParameters | None = None) -> None:

@@ -83,7 +83,7 @@ class MuJoCoPhysics:
         self._batch = Batch(model, num_robots, threads)
         joints = len(spec.joints)  # a base that floats comes before them
         self._position, self._velocity = self._batch.bind("qpos")[:, -joints:], self._batch.bind("qvel")[:, -joints:]
-        self._base = FloatingBodies(spec.floating, self._batch) if spec.floating else None
+        self._base = FloatingBodies(spec.floating, spec.base, self._batch) if spec.floating else None
         names, mass = loaded_links(spec), model.body_mass
         self._links = [model.body(name).id for name in names]
         self._tip = model.body(spec.carrier).id
@@ -139,13 +139,13 @@ class MuJoCoPhysics:
         return state if self._base is None else self._base.added_to(state)
 
     def parameters(self) -> DynamicsParameters:
-        """Masses and damping as MuJoCo holds them; the rest as the motors got it."""
+        """What the bodies are like as MuJoCo holds it; the rest as the motors got it."""
         parameters = {key: value.copy() for key, value in self._parameters.items()}
         parameters["joint_damping"] = self._damping[:, -len(self._spec.joints) :].copy()
         mass = self._mass.copy()
         mass[:, self._tip] -= parameters["payload"][:, 0]
         parameters["link_mass"] = mass[:, self._moving]
-        return parameters
+        return parameters if self._base is None else parameters | self._base.parameters()
 
     def state(self) -> dict[str, np.ndarray]:
         """See :meth:`physai.physics.Physics.state`."""

@@ -36,15 +36,18 @@ class FloatingBodies:
 
     Args:
         floating: The robot's.
+        base: Name of the body that is its base.
         batch: The robots.
     """
 
-    def __init__(self, floating: FloatingBase, batch: Batch) -> None:
+    def __init__(self, floating: FloatingBase, base: str, batch: Batch) -> None:
         self._pose, self._twist = batch.bind("qpos")[:, :7], batch.bind("qvel")[:, :6]
         self._warm_start, self._found = batch.bind("qacc_warmstart"), batch.bind("sensordata")
         model = batch.model
         self._spheres = [model.geom(f"sphere{index}").id for index in range(len(floating.spheres))]
-        self._friction = batch.expand("geom_friction")
+        self._friction, self._centers = batch.expand("geom_friction"), batch.expand("body_ipos")
+        self._base = model.body(base).id
+        self._center = model.body_ipos[self._base].copy()
         links = [floating.links.index(sphere.link) for sphere in floating.spheres]
         self._of_link = np.eye(len(floating.links), dtype=bool)[links]  # [spheres, links]
         self._contact = np.zeros((batch.nsim, len(floating.links)), bool)
@@ -62,6 +65,12 @@ class FloatingBodies:
     def set(self, rows: np.ndarray, parameters: DynamicsParameters) -> None:
         """Give them new dynamics."""
         self._friction[rows[:, None], self._spheres, 0] = parameters["floor_friction"]
+        self._centers[rows, self._base] = self._center + parameters["center_of_mass"]
+
+    def parameters(self) -> DynamicsParameters:
+        """Return their dynamics, as MuJoCo holds them."""
+        friction = self._friction[:, self._spheres[:1], 0]
+        return {"floor_friction": friction, "center_of_mass": self._centers[:, self._base] - self._center}
 
     def update(self) -> None:
         """See which links touch the floor."""

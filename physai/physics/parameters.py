@@ -1,5 +1,7 @@
 """Everything that makes one robot differ from the next, as one row of numbers per robot."""
 
+from collections.abc import Sequence
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -7,12 +9,13 @@ from torch import Tensor
 from physai.physics.interface import DynamicsParameters, nominal_dynamics
 from physai.robots import RobotSpec
 
-# By how much robots differ in what their description says is zero: kg, Nms/rad, Nm, control steps, rad, rad, rad/s,
-# rad/s, a share of 9.81 m/s², m/s.
+# By how much robots differ in what their description says is zero: kg, Nms/rad, Nm, m, control steps, rad, rad,
+# rad/s, rad/s, a share of 9.81 m/s², m/s.
 _USUAL = {
     "payload": 0.5,
     "joint_damping": 0.1,
     "joint_friction": 0.1,
+    "center_of_mass": 0.02,
     "actuator_delay": 1.0,
     "encoder_offset": 0.01,
     "position_noise": 0.005,
@@ -32,13 +35,19 @@ class ParameterLayout:
     ``gravity_noise`` (of a direction of length 1) of its IMU, standard deviations, and ``push`` (m/s): by how much the
     base's velocity jumps now and then.
 
+    Args:
+        spec: The robot.
+        ignored: Dynamics that its engine leaves as described (:attr:`physai.physics.Physics.ignores`).
+
     Attributes:
         columns: Name to slice.
+        ignored: As given.
         nominal: The robot of the URDF with perfect sensors and no delay, [P].
         labels: One readable name a column, such as ``link_mass[link1]``.
     """
 
-    def __init__(self, spec: RobotSpec) -> None:
+    def __init__(self, spec: RobotSpec, ignored: Sequence[str] = ()) -> None:
+        self.ignored = tuple(ignored)
         self._dynamics = nominal_dynamics(spec)
         rows = {
             **{name: value[0] for name, value in self._dynamics.items()},
@@ -55,8 +64,8 @@ class ParameterLayout:
         for name, value in rows.items():
             self.columns[name] = slice(start, start + len(value))
             start += len(value)
-            of = spec.moving_links if name == "link_mass" else spec.joints
-            self.labels += [name] if len(value) == 1 else [f"{name}[{part}]" for part in of]
+            parts = {"link_mass": spec.moving_links, "center_of_mass": ("x", "y", "z")}.get(name, spec.joints)
+            self.labels += [name] if len(value) == 1 else [f"{name}[{part}]" for part in parts]
         self.nominal: Tensor = torch.from_numpy(np.concatenate(list(rows.values()))).float()
         usual = np.concatenate([np.full(len(value), _USUAL.get(name, 1.0)) for name, value in rows.items()])
         self._scale = np.where(self.nominal.numpy() > 0, self.nominal.numpy(), usual).astype(np.float32)

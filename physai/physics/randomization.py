@@ -81,6 +81,7 @@ _LOWEST = {
     "link_mass": 1e-3,
     "velocity_gain": 1e-3,
     "stiffness": 1e-3,
+    "center_of_mass": -math.inf,
     "encoder_offset": -math.inf,
 }  # and zero for the others
 
@@ -101,6 +102,7 @@ class RandomizationConfig(Config):
     stiffness: Draw | None
     servo_damping: Draw | None
     floor_friction: Draw | None
+    center_of_mass: Draw | None
     actuator_delay: Draw | None
     encoder_offset: Draw | None
     position_noise: Draw | None
@@ -120,21 +122,23 @@ class RandomizationConfig(Config):
         return {name: draw for name, draw in self if name != "name" and draw is not None}
 
     def of(self, layout: ParameterLayout) -> "RandomizationConfig":
-        """Return what is drawn of it for a robot."""
-        others = {name: None for name in self.draws if name not in layout.columns}
+        """Return what is drawn of it for a robot in its engine."""
+        others = {name: None for name in self.draws if name not in layout.columns or name in layout.ignored}
         return self.model_copy(update=others) if others else self
 
     def affects(self, *names: str) -> bool:
         """Whether any of these parameters is drawn."""
         return any(name in self.draws for name in names)
 
-    def without_effect(self, layout: ParameterLayout) -> list[str]:
-        """Name the parameters whose draw changes nothing: a scale of what is zero in the robot's description."""
-        return [
-            name
+    def without_effect(self, layout: ParameterLayout) -> dict[str, str]:
+        """Name the parameters whose draw changes nothing, and say why."""
+        zero = "it scales what is zero in the robot's description, unless its YAML gives some"
+        scaled = {
+            name: zero
             for name, draw in self.of(layout).draws.items()
             if draw.operation == "scale" and not layout.nominal[layout.columns[name]].any()
-        ]
+        }
+        return scaled | {name: "this engine cannot change it" for name in layout.ignored if name in self.draws}
 
     def check(self, layout: ParameterLayout) -> None:
         """Raise a UserError if a list has not one value for each column of its parameter."""

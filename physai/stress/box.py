@@ -49,7 +49,8 @@ def find_box(trial: Trial, randomization: RandomizationConfig) -> Box:
 
     It expects that a policy that fails in a box fails in a larger one, too.
     """
-    ranges = Ranges(randomization, ParameterLayout(RobotSpec.from_config(trial.policy.config.env.robot)))
+    env = trial.policy.config.env
+    ranges = Ranges(randomization, ParameterLayout(RobotSpec.from_config(env.robot), env.ignored))
 
     def settled(share: float) -> int:
         ranges.move(torch.full_like(ranges.share, share))

@@ -92,11 +92,8 @@ def run_training(
     with contextlib.closing(agent), stop_signals() as stop:
         for doubt in agent.env.simulation.spec.doubtful:
             print(doubt)
-        for name in config.randomization.without_effect(agent.env.simulation.layout):
-            robot = config.env.robot.name
-            print(
-                f"randomization.{name} has no effect: it scales what is zero in '{robot}', unless its YAML gives some"
-            )
+        for name, why in config.randomization.without_effect(agent.env.simulation.layout).items():
+            print(f"randomization.{name} has no effect: {why}")
         evaluation = EvaluationCallback(config, watch)
         trainer = make_trainer(config, run_dir, agent, evaluation, resume)
         trainer.fit(stop)

@@ -1,5 +1,6 @@
 """Robots whose base nothing holds, in each engine: they fall, stand, touch the floor, and are put anywhere."""
 
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -112,6 +113,26 @@ def test_less_friction_lets_a_robot_slide_farther(legged, make):
         physics.reset(np.array([0]), state, parameters)
         slid.append(float(stand(physics, legged, 0.6).base_pose[0, 0]))
     assert slid[0] > 1.5 * slid[1]
+
+
+@pytest.mark.parametrize("in_its_frame", [False, True])
+def test_a_base_with_another_centre_of_mass_moves_in_mujoco_as_if_it_were_described_so(legged, in_its_frame):
+    def described(com):
+        base, *others = legged.bodies
+        inertia = np.eye(3) * np.trace(base.inertia) / 3 if in_its_frame else base.inertia
+        return replace(legged, bodies=(replace(base, com=com, inertia=inertia), *others))
+
+    com, shift = legged.bodies[0].com * (not in_its_frame), np.array([0.03, -0.02, 0.01])
+    given, expected = (ENGINES["mujoco"](described(each), 1, DT, SUBSTEPS) for each in (com, com + shift))
+    row, parameters = np.array([0]), nominal_dynamics(legged)
+    before = stand(given, legged, 0.4)
+    given.reset(row, at_home(legged, 1), {**parameters, "center_of_mass": shift[None]})
+    expected.reset(row, at_home(legged, 1), parameters)
+    moved, told = stand(given, legged, 0.4), stand(expected, legged, 0.4)
+    np.testing.assert_allclose(moved.joint_position, told.joint_position, atol=1e-9)
+    np.testing.assert_allclose(moved.base_pose, told.base_pose, atol=1e-9)
+    assert np.abs(moved.joint_effort - before.joint_effort).max() > 0.5
+    np.testing.assert_allclose(given.parameters()["center_of_mass"], shift[None], atol=1e-12)
 
 
 def test_mujoco_goes_on_from_a_saved_state_bit_for_bit_and_a_reset_robot_is_as_a_fresh_one(legged):

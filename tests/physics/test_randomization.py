@@ -35,29 +35,38 @@ def drawn(name, operation):
 
 def test_a_scale_of_what_the_robot_s_description_leaves_at_zero_is_named(kuka):
     assert not kuka.nominal[kuka.columns["joint_friction"]].any()
-    assert drawn("joint_friction", "scale").without_effect(kuka) == ["joint_friction"]
+    assert drawn("joint_friction", "scale").without_effect(kuka).keys() == {"joint_friction"}
     assert "joint_friction" in config("randomization=default").without_effect(kuka)
 
 
 @pytest.mark.parametrize("operation", ["add", "set"])
 def test_what_is_added_or_set_has_an_effect_on_zero(kuka, operation):
-    assert drawn("joint_friction", operation).without_effect(kuka) == []
+    assert drawn("joint_friction", operation).without_effect(kuka) == {}
 
 
 @pytest.mark.parametrize("randomization", ["none", "default", "strong"])
 def test_all_that_is_drawn_for_the_planar_arm_has_an_effect(layout, randomization):
-    assert config(f"randomization={randomization}").without_effect(layout) == []
+    assert config(f"randomization={randomization}").without_effect(layout) == {}
 
 
 @pytest.mark.parametrize("name", ["payload", "actuator_delay", "encoder_offset", "position_noise", "velocity_noise"])
 def test_what_is_zero_on_every_robot_cannot_be_scaled(layout, name):
-    assert drawn(name, "scale").without_effect(layout) == [name]
+    assert drawn(name, "scale").without_effect(layout).keys() == {name}
+
+
+def test_what_an_engine_cannot_change_is_not_drawn_and_named(env_config):
+    env = env_config("a1_walk")
+    layout = ParameterLayout(RobotSpec.from_config(env.robot), env.ignored)
+    default = config("randomization=default")
+    assert default.without_effect(layout)["center_of_mass"] == "this engine cannot change it"
+    sampled = default.sample(8, layout, torch.Generator().manual_seed(0))
+    assert not sampled[:, layout.columns["center_of_mass"]].any()
 
 
 def test_a_scale_counts_when_a_single_joint_has_something_to_scale(planar):
     half = ParameterLayout(planar)
     half.nominal[half.columns["joint_damping"]] *= half.nominal.new_tensor([0.0, 1.0])
-    assert drawn("joint_damping", "scale").without_effect(half) == []
+    assert drawn("joint_damping", "scale").without_effect(half) == {}
 
 
 def of_columns(low, high):

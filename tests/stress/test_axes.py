@@ -22,7 +22,7 @@ def axis(reacher):
     return lambda name, *overrides: Axis.make(name, settings(*overrides).axes, reacher)
 
 
-OF_LEGS = ("stiffness", "servo_damping", "floor_friction", "push", "gyro_noise", "gravity_noise")
+OF_LEGS = {"stiffness", "servo_damping", "floor_friction", "center_of_mass", "push", "gyro_noise", "gravity_noise"}
 
 
 def test_scales_are_even_in_their_logarithm_and_others_as_they_are(axis):
@@ -39,7 +39,7 @@ def test_delays_are_whole_control_steps_each_once(axis):
 
 def test_every_axis_of_the_config_can_be_made_and_every_parameter_that_is_drawn_is_one(env_config):
     config = env_config("reacher", "physics=mujoco", "physics.motor=servo")
-    legged = env_config("a1_walk")
+    legged = env_config("a1_walk", "physics=mujoco")
     axes = settings().axes
     made = [Axis.make(name, axes, legged if name in OF_LEGS else config).name for name in axes]
     assert made == list(axes)
@@ -68,7 +68,7 @@ def test_what_makes_no_sense_is_refused_in_one_line(axis, name, overrides, said)
 
 @pytest.mark.parametrize("name", sorted(set(RandomizationConfig.model_fields) - {"name"}))
 def test_a_value_reaches_every_robot_and_leaves_the_other_draws_as_they_are(reacher, env_config, name):
-    env = env_config("a1_walk") if name in OF_LEGS else reacher
+    env = env_config("a1_walk", "physics=mujoco") if name in OF_LEGS else reacher
     layout = ParameterLayout(RobotSpec.from_config(env.robot))
     config = validate(RandomizationConfig, compose("train", []).randomization)
     drawn = Axis.make(name, settings().axes, env)

@@ -121,7 +121,7 @@ class VirtualArm:
         substeps = max(1, math.ceil(config.substeps * period / config.control_dt - 1e-9))
         sizes = 1, period, substeps
         self._physics: Physics = make("physics", config.physics, self.spec, *sizes, needs=("reset", "step", "close"))
-        layout = ParameterLayout(self.spec)
+        layout = ParameterLayout(self.spec, config.ignored)
         draws.check(layout)
         self._parameters = draws.sample(1, layout, torch.Generator().manual_seed(derive(seed, "virtual robot")))
         self._dynamics = layout.dynamics(self._parameters.numpy(), config.control_dt / period)
