@@ -1,6 +1,7 @@
 """Every file in ``conf/`` composes into a valid config; walking the folders tests what is added."""
 
 import os
+from collections.abc import Callable
 from functools import cache, partial
 from pathlib import Path
 
@@ -47,10 +48,14 @@ BESIDE = {  # what a choice of these is made with
 }
 
 
-def small(*overrides: str) -> TrainConfig:
-    """A config of few robots and small batches."""
-    minibatch = ["algo.minibatch_size=32"] if "minibatch_size" in compose("train", overrides).algo else []
-    return validate(TrainConfig, compose("train", [*overrides, *SMALL, *minibatch]))
+def small(*overrides: str, teacher: Callable[[], Path] | None = None) -> TrainConfig:
+    """A config of few robots and small batches, with a teacher where one is missing."""
+    node = compose("train", [*overrides, *SMALL])  # a sixth of a second; once will do
+    if "minibatch_size" in node.algo:
+        node.algo.minibatch_size = 32
+    if teacher is not None and OmegaConf.is_missing(node.algo, "teacher"):
+        node.algo.teacher = str(teacher())
+    return validate(TrainConfig, node)
 
 
 @pytest.mark.slow
@@ -65,10 +70,7 @@ def small(*overrides: str) -> TrainConfig:
 def test_every_choice_builds_and_collects(override, request):
     group, name = override.split("=")
     beside = [BESIDE[group](name)] if group in BESIDE else []
-    if OmegaConf.is_missing(compose("train", [*beside, override]).algo, "teacher"):
-        beside.append(f"algo.teacher={request.getfixturevalue('teacher_run')}")
-    config = small(*beside, override)
-    agent = Agent.build(config)
+    agent = Agent.build(small(*beside, override, teacher=partial(request.getfixturevalue, "teacher_run")))
     batch = next(iter(agent.collector))
     assert batch.shape == (4, 16)
     agent.algorithm.update(batch)

@@ -108,7 +108,7 @@ from importlib.util import find_spec
 from physai.deploy import ControllerConfig, Goal, Imu, JointState, load_policy, make_controller
 policy = load_policy(sys.argv[1])
 about = policy.metadata
-controller, at, told = make_controller(policy, ControllerConfig()), about.home, []
+controller, at, told = make_controller(policy, ControllerConfig(), lambda: 0.0), about.home, []  # on time, however busy
 for tick in range(150):
     now = 100.0 + 0.02 * tick
     joints = JointState(about.joints, at, 0.0 * at, now)
