@@ -16,8 +16,9 @@ one a joint of ``joint_damping`` (N·m·s/rad), ``joint_friction`` (N·m), ``eff
 substeps, a gain g is a motor with the time constant (1 - g) / g, in control periods).
 
 Joints that are springs have, in the place of that gain, ``stiffness`` (N·m/rad) and ``servo_damping`` (N·m·s/rad). A
-robot whose base floats has ``floor_friction`` (a coefficient, 1) and ``center_of_mass`` (of the base: how far it is
-from where the description has it, m, in the base's frame, 3)."""
+robot whose base floats has ``floor_friction`` (a coefficient, 1), ``contact_time`` (of contacts with the floor: the
+time constant with which what has sunk in is pushed out, s, 1) and ``center_of_mass`` (of the base: how far it is from
+where the description has it, m, in the base's frame, 3)."""
 
 
 def nominal_dynamics(spec: RobotSpec) -> DynamicsParameters:
@@ -34,7 +35,9 @@ def nominal_dynamics(spec: RobotSpec) -> DynamicsParameters:
     else:
         nominal |= {"stiffness": spec.servo.stiffness[None], "servo_damping": spec.servo.damping[None]}
     if spec.floating is not None:
-        nominal |= {"floor_friction": np.full((1, 1), spec.floating.friction), "center_of_mass": np.zeros((1, 3))}
+        of_floor = {"floor_friction": spec.floating.friction, "contact_time": spec.floating.contact_time}
+        nominal |= {name: np.full((1, 1), value) for name, value in of_floor.items()}
+        nominal["center_of_mass"] = np.zeros((1, 3))
     return nominal
 
 

@@ -16,8 +16,8 @@ _POSITION, _QUATERNION = slice(0, 3), [4, 5, 6, 3]  # MuJoCo has w, x, y, z
 def put_on_floor(made: "mujoco.MjSpec", floating: FloatingBase, base: str) -> None:
     """Let the base of a robot go, put a floor below it, and sense which links touch that.
 
-    Only spheres and floor meet, and friction is that of the spheres. Links are told apart by the force that a sensor
-    of each body's spheres feels.
+    Only spheres and floor meet, and friction and softness are those of the spheres. Links are told apart by the force
+    that a sensor of each body's spheres feels.
     """
     made.body(base).add_freejoint()
     floor = made.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0.0, 0.0, 1.0], name="floor")
@@ -45,7 +45,8 @@ class FloatingBodies:
         self._warm_start, self._found = batch.bind("qacc_warmstart"), batch.bind("sensordata")
         model = batch.model
         self._spheres = [model.geom(f"sphere{index}").id for index in range(len(floating.spheres))]
-        self._friction, self._centers = batch.expand("geom_friction"), batch.expand("body_ipos")
+        self._friction, self._contact_time = batch.expand("geom_friction"), batch.expand("geom_solref")
+        self._centers = batch.expand("body_ipos")
         self._base = model.body(base).id
         self._center = model.body_ipos[self._base].copy()
         links = [floating.links.index(sphere.link) for sphere in floating.spheres]
@@ -65,12 +66,17 @@ class FloatingBodies:
     def set(self, rows: np.ndarray, parameters: DynamicsParameters) -> None:
         """Give them new dynamics."""
         self._friction[rows[:, None], self._spheres, 0] = parameters["floor_friction"]
+        self._contact_time[rows[:, None], self._spheres, 0] = parameters["contact_time"]
         self._centers[rows, self._base] = self._center + parameters["center_of_mass"]
 
     def parameters(self) -> DynamicsParameters:
         """Return their dynamics, as MuJoCo holds them."""
-        friction = self._friction[:, self._spheres[:1], 0]
-        return {"floor_friction": friction, "center_of_mass": self._centers[:, self._base] - self._center}
+        one = self._spheres[:1]
+        return {
+            "floor_friction": self._friction[:, one, 0],
+            "contact_time": self._contact_time[:, one, 0],
+            "center_of_mass": self._centers[:, self._base] - self._center,
+        }
 
     def update(self) -> None:
         """See which links touch the floor."""

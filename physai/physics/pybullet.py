@@ -46,8 +46,8 @@ class PyBulletPhysics:
 
     The interface is :class:`physai.physics.Physics`. Joints that the spec does not control are welded at zero, and
     shapes are left out but for the spheres with which a robot that stands on the floor touches it. Robots never touch
-    each other. Centres of mass stay where the description has them. What PyBullet remembers of contacts is no part of
-    the state: with a floating base, a restored robot goes on as before, but not to the last bit.
+    each other. Contacts are hard, and centres of mass stay where the description has them. What PyBullet remembers of
+    contacts is no part of the state: with a floating base, a restored robot goes on as before, but not to the last bit.
 
     Joints that are springs (``servo`` of the robot) are given their effort once a substep. Elsewhere each joint
     is driven by PyBullet's velocity motor with a limited effort; where the robot takes positions, a servo
@@ -65,7 +65,7 @@ class PyBulletPhysics:
     """
 
     simulated = True
-    ignores = ("center_of_mass",)
+    ignores = "contact_time", "center_of_mass"
 
     def __init__(self, spec: RobotSpec, num_robots: int, control_dt: float, substeps: int = 1) -> None:
         self.num_robots = num_robots

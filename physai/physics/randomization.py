@@ -81,6 +81,7 @@ _LOWEST = {
     "link_mass": 1e-3,
     "velocity_gain": 1e-3,
     "stiffness": 1e-3,
+    "contact_time": 1e-3,
     "center_of_mass": -math.inf,
     "encoder_offset": -math.inf,
 }  # and zero for the others
@@ -102,6 +103,7 @@ class RandomizationConfig(Config):
     stiffness: Draw | None
     servo_damping: Draw | None
     floor_friction: Draw | None
+    contact_time: Draw | None
     center_of_mass: Draw | None
     actuator_delay: Draw | None
     encoder_offset: Draw | None

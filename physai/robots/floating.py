@@ -27,11 +27,13 @@ class FloatingConfig(Config):
     """A base that nothing holds, above a floor.
 
     ``height`` is that of its frame while the robot stands at home, m; ``spheres`` are all of the robot that can touch
-    the floor, whose ``friction`` is a coefficient; ``feet`` are the links that it stands on.
+    the floor, whose ``friction`` is a coefficient; ``contact_time`` says how soft feet and floor are: the time constant
+    with which what has sunk in is pushed out again, s; ``feet`` are the links that it stands on.
     """
 
     height: PositiveFloat
     friction: PositiveFloat
+    contact_time: PositiveFloat
     feet: Annotated[list[str], Field(min_length=1)]
     spheres: Annotated[list[SphereConfig], Field(min_length=1)]
 
@@ -67,6 +69,7 @@ class FloatingBase:
     Attributes:
         height: Of the base above the floor at home, m.
         friction: Between robot and floor.
+        contact_time: Time constant of a contact with the floor, s.
         spheres: All that can touch the floor.
         links: Those that can, in the order of :attr:`physai.physics.RobotState.contact`.
         feet: The places of the feet among them.
@@ -74,6 +77,7 @@ class FloatingBase:
 
     height: float
     friction: float
+    contact_time: float
     spheres: tuple[Sphere, ...]
     links: tuple[str, ...]
     feet: tuple[int, ...]
@@ -106,7 +110,7 @@ class FloatingBase:
             if foot not in links:
                 raise UserError(f"robot '{name}': floating.feet: '{foot}' has no sphere{nearest(foot, links)}")
         feet = tuple(links.index(foot) for foot in config.feet)
-        return cls(config.height, config.friction, tuple(spheres), links, feet)
+        return cls(config.height, config.friction, config.contact_time, tuple(spheres), links, feet)
 
 
 @dataclass(frozen=True)

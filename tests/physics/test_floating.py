@@ -115,6 +115,18 @@ def test_less_friction_lets_a_robot_slide_farther(legged, make):
     assert slid[0] > 1.5 * slid[1]
 
 
+def test_in_mujoco_feet_sink_into_a_softer_floor(legged):
+    times, feet = (0.01, 0.02, 0.04), legged.floating.feet
+    physics = ENGINES["mujoco"](legged, len(times), DT, SUBSTEPS)
+    parameters = {key: value.repeat(len(times), axis=0) for key, value in nominal_dynamics(legged).items()}
+    parameters["contact_time"] = np.array(times)[:, None]
+    physics.reset(np.arange(len(times)), at_home(legged, len(times)), parameters)
+    state = stand(physics, legged, 2.0)
+    assert state.contact[:, feet].all()
+    assert (np.diff(state.base_pose[:, 2]) < -1e-3).all()
+    np.testing.assert_array_equal(physics.parameters()["contact_time"], parameters["contact_time"])
+
+
 @pytest.mark.parametrize("in_its_frame", [False, True])
 def test_a_base_with_another_centre_of_mass_moves_in_mujoco_as_if_it_were_described_so(legged, in_its_frame):
     def described(com):

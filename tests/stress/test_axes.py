@@ -22,7 +22,8 @@ def axis(reacher):
     return lambda name, *overrides: Axis.make(name, settings(*overrides).axes, reacher)
 
 
-OF_LEGS = {"stiffness", "servo_damping", "floor_friction", "center_of_mass", "push", "gyro_noise", "gravity_noise"}
+OF_FLOOR = {"floor_friction", "contact_time"}
+OF_LEGS = OF_FLOOR | {"stiffness", "servo_damping", "center_of_mass", "push", "gyro_noise", "gravity_noise"}
 
 
 def test_scales_are_even_in_their_logarithm_and_others_as_they_are(axis):
