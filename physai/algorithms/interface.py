@@ -1,5 +1,6 @@
 """What the training loop knows of an algorithm, and what an algorithm is given."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -18,11 +19,13 @@ class Networks:
         actor: The policy; for losses that draw from it, ``dist_sample_keys`` and ``log_prob_keys`` tell what was drawn.
         critic: Judges states, or actions in states.
         normalizer: Makes ``normalized_observation`` of an ``observation``, with the statistics of now; on the CPU.
+        mirror: Makes what turns frames into those of a mirror image; raises a UserError where robots have none.
     """
 
     actor: TensorDictModuleBase
     critic: TensorDictModuleBase
     normalizer: Normalizer
+    mirror: Callable[[], Callable[[TensorDictBase], TensorDictBase]]
 
     @property
     def device(self) -> torch.device:

@@ -40,6 +40,9 @@ class OnPolicy(GradientAlgorithm):
             twice as far makes the learning rate 1.5 times smaller, half as far 1.5 times larger, within 1e-5 and 1e-3
             (Rudin et al., "Learning to Walk in Minutes Using Massively Parallel Deep Reinforcement Learning", CoRL
             2021). None leaves the rate to the schedule.
+        symmetry: Learn from the mirror image of each frame, too: a minibatch comes with its own (Mittal et al.,
+            "Symmetry Considerations for Learning Task Symmetric Robot Policies", ICRA 2024). Of robots on legs, and
+            of actors that do not remember.
     """
 
     warmup_frames = 0
@@ -57,6 +60,7 @@ class OnPolicy(GradientAlgorithm):
         epochs: Count,
         max_grad_norm: PositiveFloat,
         target_kl: PositiveFloat | None = None,
+        symmetry: bool = False,
     ) -> None:
         check_minibatch(minibatch_size, frames_per_batch)
         drawn, held = buffer.batch_size, buffer.storage.max_size
@@ -78,6 +82,9 @@ class OnPolicy(GradientAlgorithm):
         self.minibatch_size = minibatch_size
         self._device = networks.device
         self._in_sequences = getattr(networks.actor, "memory_size", 0) > 0
+        if symmetry and self._in_sequences:
+            raise UserError("algo.symmetry: what an actor remembers has no mirror image")
+        self._mirror = networks.mirror() if symmetry else None
         # What comes after a frame has done its part once there are advantages; each key is gathered in each epoch.
         now = [key for key in self.loss.in_keys if not (isinstance(key, tuple) and key[0] == "next")]
         self._judged = self.advantage.tensor_keys.value, self.advantage.tensor_keys.value_target
@@ -90,11 +97,14 @@ class OnPolicy(GradientAlgorithm):
         Raises:
             NonFiniteError: If a loss or gradient is not finite; the step is not taken.
         """
+        image = None if self._mirror is None else self._mirror(batch.exclude("next"))
         if self._device.type != "cpu":
             batch = batch.to(self._device)
         with torch.no_grad():
             self.advantage(batch)
         frames = batch.select(*self._keys, strict=False)
+        if image is not None:
+            frames.set("image", image.select(*self._keys, strict=False).to(self._device))
         if not self._in_sequences:
             self.buffer.empty()
             self.buffer.extend(frames.reshape(-1))
@@ -102,6 +112,9 @@ class OnPolicy(GradientAlgorithm):
         for _ in range(self.epochs):
             in_order = sequences(frames, self.minibatch_size) if self._in_sequences else self._minibatches()
             for minibatch in in_order:
+                if image is not None:
+                    own = minibatch.exclude("image")
+                    minibatch = torch.cat([own, own.clone(recurse=False).update(minibatch.get("image"))])
                 losses = self.loss(minibatch)
                 results.append(losses.set("grad_norm", self.step(losses, minibatch)))
         with torch.no_grad():

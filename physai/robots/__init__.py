@@ -12,6 +12,7 @@ from physai.robots.kinematics import (
     quaternion_matrix,
     rotation_vector,
 )
+from physai.robots.mirror import Mirror
 from physai.robots.spec import RobotConfig, RobotSpec
 
 __all__ = [
@@ -20,6 +21,7 @@ __all__ = [
     "ForwardKinematics",
     "InverseKinematics",
     "JointCommand",
+    "Mirror",
     "RobotConfig",
     "RobotSpec",
     "angle_between",

@@ -16,6 +16,7 @@ from torchrl.record.loggers import TensorboardLogger
 from physai.algorithms import Algorithm, Networks
 from physai.collectors import FrameSource, make_collector
 from physai.envs.make import TransformedRobotEnv, make_env
+from physai.envs.mirror import MirrorImage
 from physai.errors import UserError
 from physai.physics import RandomizationConfig
 from physai.policies import input_size
@@ -89,7 +90,7 @@ class Agent:
             "algo",
             config.algo,
             needs=("update", "weights", "state", "set_state", "warmup_frames"),
-            networks=Networks(actor, critic, env.normalizer),
+            networks=Networks(actor, critic, env.normalizer, partial(MirrorImage, env.simulation, env.normalizer)),
             frames_per_batch=config.collector.frames_per_batch,
             **taught,
         )

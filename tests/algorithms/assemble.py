@@ -7,5 +7,5 @@ from physai.transforms.normalization import Normalizer
 
 
 def assemble(node, actor, critic, frames_per_batch, normalizer=None):
-    networks = Networks(actor, critic, normalizer or Normalizer(8, 10.0))
+    networks = Networks(actor, critic, normalizer or Normalizer(8, 10.0), lambda: None)
     return instantiate(node, _partial_=True, _convert_="all")(networks=networks, frames_per_batch=frames_per_batch)

@@ -1,0 +1,112 @@
+"""The mirror image of a robot on legs: it moves as the robot does, on the other side."""
+
+import numpy as np
+import pytest
+import torch
+from tensordict import TensorDict
+
+from physai.compose import compose
+from physai.config import validate
+from physai.envs.mirror import MirrorImage
+from physai.envs.simulation import Simulation
+from physai.errors import UserError
+from physai.physics import RandomizationConfig
+from physai.robots import Mirror, RobotSpec
+from physai.transforms.normalization import Normalizer
+
+ROBOTS = 8
+
+
+@pytest.fixture(scope="module")
+def pair(env_config):
+    """Robots that differ, and what shall be their mirror images."""
+    config = env_config("a1_walk", "physics=mujoco", "env.start.spread=0")
+    made = [Simulation(config, ROBOTS, seed=0) for _ in range(2)]
+    yield made
+    for simulation in made:
+        simulation.close()
+
+
+def image_of(simulation, **frames):
+    mirror = MirrorImage(simulation, Normalizer(45, 10.0))
+    told = {**simulation.sense(), **simulation.true_base(), **frames}
+    told = {name: torch.from_numpy(np.asarray(value)).float() for name, value in told.items()}
+    return mirror(TensorDict(told, [ROBOTS]))
+
+
+def test_robots_that_are_mirrored_and_told_the_mirrored_move_as_the_mirror_image(pair):
+    robots, others = pair
+    draws = validate(RandomizationConfig, compose("train", []).randomization)
+    parameters = draws.sample(ROBOTS, robots.layout, torch.Generator().manual_seed(0)).numpy()
+    columns = robots.layout.columns
+    parameters[:, columns["push"]] = 0.0
+    # The base of the A1 is heavier on its left; these are as heavy on both sides on average.
+    base = robots.spec.bodies[0]
+    parameters[:, columns["center_of_mass"]] += np.array([0.0, -2.0 * base.com[1], 0.0]) * (np.arange(ROBOTS) % 2)[:, None]
+    robots.reset(parameters=parameters)
+    others.reset(parameters=image_of(robots, physics_parameters=parameters)["physics_parameters"].numpy())
+    others.aim(image_of(robots)["goal"].numpy())
+    random = np.random.default_rng(0)
+    for _ in range(20):
+        action = random.uniform(-0.5, 0.5, (ROBOTS, 12)).astype(np.float32)
+        image = image_of(robots, action=action)
+        others.step(image["action"].numpy())
+        robots.step(action)
+    expected, found = image_of(robots), others.sense() | others.true_base()
+    for name, near in {"joint_position": 0.02, "gravity": 0.02, "base_velocity": 0.05, "goal": 1e-6}.items():
+        off = np.abs(found[name] - expected[name].numpy())
+        assert off.mean() < near, name
+        if name != "goal":
+            own = robots.sense() | robots.true_base()
+            assert np.abs(found[name] - own[name]).mean() > 3 * off.mean(), name
+    np.testing.assert_allclose(others.episode_rewards, robots.episode_rewards, atol=0.05)
+
+
+def test_the_gait_of_the_mirror_image_is_its_image(pair):
+    robots, _ = pair
+    robots.reset()
+    robots.aim(np.tile(np.float32([[0.5, 0.2, -0.3]]), (ROBOTS, 1)))
+    clock = np.linspace(0.0, robots.task.module.period, ROBOTS, endpoint=False)[:, None]
+    image, mirror = image_of(robots, clock=clock), Mirror.of(robots.spec)
+    told = {name: torch.from_numpy(value).float() for name, value in robots.sense().items()}
+    told["clock"] = torch.from_numpy(clock).float()
+    _, features = robots.task.module(*(told[name] for name in (*robots.task.module.senses, "goal")))
+    suggested = features[:, -12:].numpy()
+    np.testing.assert_allclose(image["features"][:, -12:], suggested[:, mirror.order] * mirror.sign, atol=1e-4)
+    assert np.abs(suggested).max() > 0.3
+
+
+def test_the_image_of_the_image_is_what_was_there(pair):
+    robots, _ = pair
+    robots.reset()
+    frames = TensorDict({name: torch.from_numpy(value).float() for name, value in robots.sense().items()}, [ROBOTS])
+    frames["past_actions"] = torch.rand(ROBOTS, 48)
+    frames["physics_parameters"] = torch.rand(ROBOTS, len(robots.layout.nominal))
+    mirror = MirrorImage(robots, Normalizer(45, 10.0))
+    twice = mirror(mirror(frames))
+    for name in frames.keys():  # noqa: SIM118 (of a TensorDict)
+        torch.testing.assert_close(twice[name], frames[name], atol=1e-6, rtol=1e-6)
+
+
+def test_pairs_of_joints_are_found_on_every_robot_on_legs(any_legged):
+    spec = RobotSpec.from_config(any_legged.robot)
+    mirror = Mirror.of(spec)
+    assert (mirror.order[mirror.order] == np.arange(len(spec.joints))).all()
+    assert (mirror.sign[mirror.order] == mirror.sign).all()
+    assert (mirror.links(spec)[mirror.links(spec)] == np.arange(len(spec.moving_links))).all()
+
+
+def test_of_an_a1_the_legs_are_swapped_and_hips_turn_the_other_way(pair):
+    spec = pair[0].spec
+    mirror = Mirror.of(spec)
+    names = [spec.joints[joint] for joint in mirror.order]
+    assert names[:3] == ["FL_hip_joint", "FL_upper_joint", "FL_lower_joint"]
+    assert mirror.sign.tolist() == [-1.0, 1.0, 1.0] * 4
+
+
+def test_what_has_no_mirror_image_is_refused_by_name(reacher, env_config):
+    with pytest.raises(UserError, match="stands on no legs"):
+        Mirror.of(RobotSpec.from_config(reacher.robot))
+    crooked = env_config("a1_walk", "env.robot.home=[0.2,0.8,-1.6,0,0.8,-1.6,0,0.8,-1.6,0,0.8,-1.6]")
+    with pytest.raises(UserError, match="its feet on the left are not where|no joint on its other side"):
+        Mirror.of(RobotSpec.from_config(crooked.robot))
