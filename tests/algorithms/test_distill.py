@@ -35,7 +35,9 @@ def make_student(remembers=True, seed=3):
 def build(student, teacher, *overrides, frames=ROWS * STEPS):
     sizes = [f"collector.frames_per_batch={frames}", f"collector.num_envs={ROWS}", "algo.minibatch_size=96"]
     node = compose("train", ["algo=distill", "algo.teacher=elsewhere", *sizes, *overrides]).algo
-    networks = Networks(student, Critic(1, ["normalized_observation"], [2], "torch.nn.Tanh"), Normalizer(1, 10.0), lambda: None)
+    networks = Networks(
+        student, Critic(1, ["normalized_observation"], [2], "torch.nn.Tanh"), Normalizer(1, 10.0), lambda: None
+    )
     partial = instantiate(node, _partial_=True, _convert_="all")
     return partial(networks=networks, frames_per_batch=frames, teacher=teacher)
 

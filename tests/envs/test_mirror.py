@@ -40,25 +40,24 @@ def test_robots_that_are_mirrored_and_told_the_mirrored_move_as_the_mirror_image
     parameters = draws.sample(ROBOTS, robots.layout, torch.Generator().manual_seed(0)).numpy()
     columns = robots.layout.columns
     parameters[:, columns["push"]] = 0.0
-    # The base of the A1 is heavier on its left; these are as heavy on both sides on average.
-    base = robots.spec.bodies[0]
-    parameters[:, columns["center_of_mass"]] += np.array([0.0, -2.0 * base.com[1], 0.0]) * (np.arange(ROBOTS) % 2)[:, None]
     robots.reset(parameters=parameters)
-    others.reset(parameters=image_of(robots, physics_parameters=parameters)["physics_parameters"].numpy())
+    mirrored = image_of(robots, physics_parameters=parameters)["physics_parameters"].numpy()
+    # The base of an A1 is heavier on its left; that of these on their right.
+    mirrored[:, columns["center_of_mass"].start + 1] -= 2.0 * robots.spec.bodies[0].com[1]
+    others.reset(parameters=mirrored)
     others.aim(image_of(robots)["goal"].numpy())
     random = np.random.default_rng(0)
     for _ in range(20):
-        action = random.uniform(-0.5, 0.5, (ROBOTS, 12)).astype(np.float32)
+        action = random.uniform(-0.3, 0.3, (ROBOTS, 12)).astype(np.float32)
         image = image_of(robots, action=action)
         others.step(image["action"].numpy())
         robots.step(action)
     expected, found = image_of(robots), others.sense() | others.true_base()
-    for name, near in {"joint_position": 0.02, "gravity": 0.02, "base_velocity": 0.05, "goal": 1e-6}.items():
-        off = np.abs(found[name] - expected[name].numpy())
-        assert off.mean() < near, name
-        if name != "goal":
-            own = robots.sense() | robots.true_base()
-            assert np.abs(found[name] - own[name]).mean() > 3 * off.mean(), name
+    np.testing.assert_array_equal(found["goal"], expected["goal"].numpy())
+    own = robots.sense() | robots.true_base()
+    for name in ("joint_position", "gravity", "base_velocity"):  # as far as the engine's own rounding grows
+        off = np.abs(found[name] - expected[name].numpy()).mean()
+        assert off < 0.2 * np.abs(found[name] - own[name]).mean(), name
     np.testing.assert_allclose(others.episode_rewards, robots.episode_rewards, atol=0.05)
 
 
@@ -108,5 +107,5 @@ def test_what_has_no_mirror_image_is_refused_by_name(reacher, env_config):
     with pytest.raises(UserError, match="stands on no legs"):
         Mirror.of(RobotSpec.from_config(reacher.robot))
     crooked = env_config("a1_walk", "env.robot.home=[0.2,0.8,-1.6,0,0.8,-1.6,0,0.8,-1.6,0,0.8,-1.6]")
-    with pytest.raises(UserError, match="its feet on the left are not where|no joint on its other side"):
+    with pytest.raises(UserError, match=r"its feet on the left are not|no joint on its other side"):
         Mirror.of(RobotSpec.from_config(crooked.robot))
