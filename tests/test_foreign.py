@@ -81,12 +81,14 @@ def test_the_same_folder_without_a_payload_is_read_resumed_and_drawn(run):
     assert json.loads((run / "summary.json").read_text())["frames"] == 2048
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", malicious.EVALUATE)
 def test_judging_a_run_from_elsewhere_executes_nothing(run, capsys, case):
     malicious.edit(run, malicious.EVALUATE[case])
     refused(capsys, evaluate, run)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", malicious.RESUME)
 def test_resuming_a_run_from_elsewhere_executes_nothing(run, capsys, case):
     malicious.edit(run, malicious.RESUME[case])

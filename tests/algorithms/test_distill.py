@@ -57,6 +57,7 @@ def learn(algorithm, batches=40):
     return [algorithm.update(draw_batch(generator))["loss_bc"] for _ in range(batches)]
 
 
+@pytest.mark.slow
 def test_a_student_that_remembers_learns_what_only_the_teacher_sees_and_one_that_does_not_cannot():
     # two seconds, for the one thing that all of this is for
     fixed = "algo.scheduler=null", "algo.optimizer.lr=1e-2"

@@ -28,6 +28,7 @@ def planted(name):
     return physics | {"_target_": f"tests.artifact.planted.{name}"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("env", ENVS)
 @pytest.mark.parametrize("engine", ["PyBullet", "MuJoCo"])
 def test_the_engines_move_each_joint_alike(env_config, env, engine):
@@ -38,6 +39,7 @@ def test_the_engines_move_each_joint_alike(env_config, env, engine):
     assert transfer.differences(config, other) == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "said"),
     [

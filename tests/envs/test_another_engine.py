@@ -78,6 +78,7 @@ def test_gymnasium_s_checker_passes_on_it(engine):
     env.close()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("engine", [[], ["env.physics=${physics}", "physics=mujoco"]], ids=["dummy", "mujoco"])
 def test_a_saved_state_goes_on_bit_for_bit_on_it(make, engine):
     env, restored = (make(4, "randomization=strong", *engine) for _ in range(2))

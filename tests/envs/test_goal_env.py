@@ -25,11 +25,13 @@ def make():
         env.close()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", GOALS)
 def test_gymnasium_s_checker_passes(make, name):
     check_env(make(name).unwrapped, skip_render_check=True)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", GOALS)
 def test_a_goal_is_achieved_where_the_end_effector_is_and_rewards_can_be_computed_for_many(make, name):
     env = make(name)
@@ -47,6 +49,7 @@ def test_a_goal_is_achieved_where_the_end_effector_is_and_rewards_can_be_compute
     assert distance == pytest.approx(info["distance"], abs=1e-5)
 
 
+@pytest.mark.slow
 def test_a_pose_with_the_opposite_quaternion_is_the_same_goal(make):
     env = make("PandaPose")
     observation, _ = env.reset(seed=0)

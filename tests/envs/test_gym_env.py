@@ -45,6 +45,7 @@ def goal_pixels(image):
     return (green > 60) & (green > 1.5 * red) & (green > 1.5 * blue)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", IDS)
 def test_gymnasium_s_checker_passes_without_a_warning(make, name):
     env = make(name).unwrapped

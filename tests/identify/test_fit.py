@@ -63,6 +63,7 @@ def test_a_robot_that_the_engine_cannot_be_is_fitted_as_well_as_it_goes_and_the_
     assert (result.after < 0.7 * result.before).all()
 
 
+@pytest.mark.slow
 def test_a_parameter_that_shows_in_no_motion_is_not_given_a_number(env_config, strong):
     """A joint that turns without end about a vertical axis moves alike wherever its encoder's zero is."""
     config = env_config("reacher", "physics=mujoco")

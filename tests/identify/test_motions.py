@@ -39,6 +39,7 @@ def begins(command, period, seconds):
     ]
 
 
+@pytest.mark.slow
 @settings(max_examples=40, deadline=None)
 @given(bounds(), st.sampled_from([0.01, 0.02, 0.05]), st.integers(0, 99))
 def test_plans_keep_limits_velocities_and_accelerations_and_end_at_home_at_rest(bounds, period, seed):
@@ -56,6 +57,7 @@ def test_plans_keep_limits_velocities_and_accelerations_and_end_at_home_at_rest(
     assert len(begins(command, period, 0.6)) >= len(motions)
 
 
+@pytest.mark.slow
 @settings(max_examples=20, deadline=None)
 @given(bounds(), st.floats(0.3, 1.0), st.integers(0, 8), st.integers(0, 99))
 def test_what_a_robot_does_not_follow_does_not_add_up(bounds, gain, delay, seed):

@@ -28,6 +28,7 @@ def test_a_robot_among_64_follows_what_it_follows_alone(spec, make):
     assert np.ptp(together[-1, 0], axis=0).min() > 0.5  # robots did go different ways
 
 
+@pytest.mark.slow
 def test_a_reset_robot_behaves_exactly_like_a_fresh_one_after_heavy_use(spec, make):
     random = np.random.default_rng(1)
     used, fresh = make(spec, 36), make(spec, 36)
@@ -55,6 +56,7 @@ def test_nominal_parameters_after_others_give_back_the_robot_as_made(spec, make)
     np.testing.assert_array_equal(run(used, velocity_commands), run(fresh, velocity_commands))
 
 
+@pytest.mark.slow
 def test_resetting_some_robots_leaves_the_others_bit_identical(spec, make):
     random = np.random.default_rng(3)
     begin = start(spec, 36, random)

@@ -51,6 +51,7 @@ def apart(spec, begin, parameters, given, substeps=1):
     return np.sqrt(np.mean((ways[1] - ways[0]) ** 2))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", [dynamics, wild])
 @pytest.mark.parametrize("substeps", [1, 4])
 def test_robots_go_where_they_go_in_pybullet(spec, kind, substeps):

@@ -26,6 +26,7 @@ def judge():
         each.close()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("surroundings", [{}, {"floor": 0.0, "boxes": [TABLE]}], ids=["alone", "at a table"])
 @pytest.mark.parametrize("robot", FITTED)
 def test_capsules_miss_no_collision_of_the_shapes_and_alarm_falsely_in_few_configurations(robot, surroundings, judge):

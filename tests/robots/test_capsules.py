@@ -40,6 +40,7 @@ def inside(parts: list[np.ndarray]) -> np.ndarray:
     return np.concatenate([*parts, *(weights @ part for part in parts)])
 
 
+@pytest.mark.slow
 def test_a_bent_link_that_is_cut_at_the_bend_needs_less_space_and_is_held_all_the_same():
     parts = bent()
     whole = Piece.of(parts)

@@ -24,6 +24,7 @@ def solved(simulation, goals):
     return simulation.task.module.inverse(goals[:, :3], quaternion_matrix(goals[:, 3:]))
 
 
+@pytest.mark.slow
 def test_nearly_all_poses_are_met_within_the_joints_limits(simulation, goals):
     found = solved(simulation, goals).double().numpy()
     error = simulation.task.error(RobotState(found, np.zeros_like(found)), goals.double().numpy())

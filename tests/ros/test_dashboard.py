@@ -148,6 +148,7 @@ def test_bad_parameters_end_it_in_one_line_and_beyond_localhost_nobody_commands_
     process.says("?token=", 60.0)
 
 
+@pytest.mark.slow
 def test_without_its_extra_one_line_names_it():
     code = "import sys; sys.modules['viser'] = None; from physai.ros.dashboard import main; sys.exit(main())"
     ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)

@@ -159,6 +159,7 @@ def test_a_port_that_is_taken_is_one_line(start):
     assert "error: cannot listen on 127.0.0.1" in second.output
 
 
+@pytest.mark.slow
 def test_without_its_extra_one_line_names_it():
     program = "import sys; sys.modules['foxglove'] = None; from physai.ros.foxglove import main; sys.exit(main())"
     ran = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)

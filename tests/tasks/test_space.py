@@ -52,6 +52,7 @@ def poses(simulation, joint_position):
     return linear[:, :, -1].double().numpy(), rotation.double().numpy()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SPACE)
 def test_what_is_seen_is_within_its_bounds_and_scripts_bit_for_bit(simulate, name):
     task = simulate(name).task
@@ -218,6 +219,7 @@ def test_a_collision_ends_the_episode_and_costs(simulate):
     np.testing.assert_allclose(paid, -20.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("overrides", "line"),
     [

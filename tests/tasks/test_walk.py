@@ -104,10 +104,12 @@ def suggested(simulation):
 WHOLE = ("env.task.max_steps=150", "env.task.goal_steps=150")
 
 
+@pytest.mark.slow
 def test_the_suggested_gait_alone_walks_about_as_it_is_told(simulate):
     assert (suggested(simulate(*WHOLE, robots=64)) < 1.5 * simulate().tolerance).all()
 
 
+@pytest.mark.slow
 def test_a_gait_that_feels_how_it_turns_follows_the_yaw_rate_better(simulate):
     blind = suggested(simulate(*WHOLE, "env.task.gait.yaw_correction=0.0", robots=64))
     assert suggested(simulate(*WHOLE, robots=64))[1] < 0.92 * blind[1]

@@ -50,6 +50,7 @@ def test_episodes_that_are_handed_over_move_the_arms_on_the_page_until_training_
         urllib.request.urlopen(shown.address)
 
 
+@pytest.mark.slow
 def test_a_page_that_cannot_be_served_stops_a_run_before_it_begins(reacher):
     with (
         serve("127.0.0.1", 0, "first", 1.0) as server,
