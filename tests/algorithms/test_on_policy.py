@@ -10,8 +10,11 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from physai.algorithms import NonFiniteError, OnPolicy
 from physai.compose import compose
+from physai.config import validate
 from physai.errors import UserError
 from physai.policies import Critic, GaussianActor
+from physai.training.agent import Agent
+from physai.training.config import TrainConfig
 from tests.algorithms.assemble import assemble
 
 GAMMA, LAMBDA = 0.9, 0.8
@@ -175,6 +178,33 @@ def test_a_loss_that_does_not_say_how_far_the_policy_moves_cannot_be_followed():
     actor, critic, _ = small_batch()
     with pytest.raises(UserError, match="target_kl: this loss does not say how far the policy moves"):
         build(actor, critic, 32, "algo=a2c", "collector.frames_per_batch=32", "+algo.target_kl=0.01")
+
+
+def test_with_symmetry_each_minibatch_comes_with_its_mirror_image():
+    actor, critic, batch = small_batch()
+    node = compose("train", ["collector.frames_per_batch=32", "algo.minibatch_size=8", "algo.symmetry=true"]).algo
+
+    def mirror(frames):
+        assert "next" not in frames.keys()  # noqa: SIM118 (of a TensorDict)
+        return frames.select("x", "latent_action").apply(torch.neg)
+
+    algorithm, seen = assemble(node, actor, critic, 32, mirror=mirror), []
+    algorithm.loss.register_forward_pre_hook(lambda _, given: seen.append(given[0].clone()))
+    algorithm.update(batch)
+    assert len(seen) == 4 * node.epochs
+    for given in seen:
+        own, image = given.split(8)
+        for name in ("x", "latent_action"):
+            assert torch.equal(image[name], -own[name])
+        for name in ("advantage", "action_log_prob", "value_target"):
+            assert torch.equal(image[name], own[name])
+
+
+def test_there_is_no_symmetry_without_legs_and_none_with_a_memory():
+    with pytest.raises(UserError, match="robot 'planar_arm' stands on no legs: it has no other side"):
+        Agent.build(validate(TrainConfig, compose("train", ["algo.symmetry=true"])))
+    with pytest.raises(UserError, match=r"algo\.symmetry: what an actor remembers has no mirror image"):
+        Agent.build(validate(TrainConfig, compose("train", ["algo.symmetry=true", "policy=gru"])))
 
 
 def test_a_loss_that_is_not_finite_stops_before_the_step_and_hands_over_the_batch():
