@@ -9,9 +9,8 @@ from physai.compose import compose
 from physai.config import validate
 from physai.envs.mirror import MirrorImage
 from physai.envs.simulation import Simulation
-from physai.errors import UserError
 from physai.physics import RandomizationConfig
-from physai.robots import Mirror, RobotSpec
+from physai.robots import Mirror
 from physai.transforms.normalization import Normalizer
 
 ROBOTS = 8
@@ -85,27 +84,3 @@ def test_the_image_of_the_image_is_what_was_there(pair):
     twice = mirror(mirror(frames))
     for name in frames.keys():  # noqa: SIM118 (of a TensorDict)
         torch.testing.assert_close(twice[name], frames[name], atol=1e-6, rtol=1e-6)
-
-
-def test_pairs_of_joints_are_found_on_every_robot_on_legs(any_legged):
-    spec = RobotSpec.from_config(any_legged.robot)
-    mirror = Mirror.of(spec)
-    assert (mirror.order[mirror.order] == np.arange(len(spec.joints))).all()
-    assert (mirror.sign[mirror.order] == mirror.sign).all()
-    assert (mirror.links(spec)[mirror.links(spec)] == np.arange(len(spec.moving_links))).all()
-
-
-def test_of_an_a1_the_legs_are_swapped_and_hips_turn_the_other_way(pair):
-    spec = pair[0].spec
-    mirror = Mirror.of(spec)
-    names = [spec.joints[joint] for joint in mirror.order]
-    assert names[:3] == ["FL_hip_joint", "FL_upper_joint", "FL_lower_joint"]
-    assert mirror.sign.tolist() == [-1.0, 1.0, 1.0] * 4
-
-
-def test_what_has_no_mirror_image_is_refused_by_name(reacher, env_config):
-    with pytest.raises(UserError, match="stands on no legs"):
-        Mirror.of(RobotSpec.from_config(reacher.robot))
-    crooked = env_config("a1_walk", "env.robot.home=[0.2,0.8,-1.6,0,0.8,-1.6,0,0.8,-1.6,0,0.8,-1.6]")
-    with pytest.raises(UserError, match=r"its feet on the left are not|no joint on its other side"):
-        Mirror.of(RobotSpec.from_config(crooked.robot))
