@@ -1,7 +1,7 @@
 """On-policy learning: advantages, then some epochs of minibatches, then the batch is forgotten."""
 
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import Any, cast
 
 import torch
 from tensordict import TensorDictBase
@@ -40,9 +40,9 @@ class OnPolicy(GradientAlgorithm):
             twice as far makes the learning rate 1.5 times smaller, half as far 1.5 times larger, within 1e-5 and 1e-3
             (Rudin et al., "Learning to Walk in Minutes Using Massively Parallel Deep Reinforcement Learning", CoRL
             2021). None leaves the rate to the schedule.
-        symmetry: Learn from the mirror image of each frame, too: a minibatch comes with its own (Mittal et al.,
-            "Symmetry Considerations for Learning Task Symmetric Robot Policies", ICRA 2024). Of robots on legs, and
-            of actors that do not remember.
+        symmetry: Learn from the mirror image of each frame, too: a minibatch comes with its own, as large as itself
+            (Mittal et al., "Symmetry Considerations for Learning Task Symmetric Robot Policies", ICRA 2024). Of
+            robots on legs, and of actors that do not remember.
     """
 
     warmup_frames = 0
@@ -84,7 +84,10 @@ class OnPolicy(GradientAlgorithm):
         self._in_sequences = getattr(networks.actor, "memory_size", 0) > 0
         if symmetry and self._in_sequences:
             raise UserError("algo.symmetry: what an actor remembers has no mirror image")
-        self._mirror = networks.mirror() if symmetry else None
+        try:
+            self._mirror = networks.mirror() if symmetry else None
+        except UserError as error:
+            raise UserError(f"algo.symmetry: {error}") from error
         # What comes after a frame has done its part once there are advantages; each key is gathered in each epoch.
         now = [key for key in self.loss.in_keys if not (isinstance(key, tuple) and key[0] == "next")]
         self._judged = self.advantage.tensor_keys.value, self.advantage.tensor_keys.value_target
@@ -112,10 +115,7 @@ class OnPolicy(GradientAlgorithm):
         for _ in range(self.epochs):
             in_order = sequences(frames, self.minibatch_size) if self._in_sequences else self._minibatches()
             for minibatch in in_order:
-                if image is not None:
-                    own = minibatch.exclude("image")
-                    minibatch = torch.cat([own, own.clone(recurse=False).update(minibatch.get("image"))])
-                losses = self.loss(minibatch)
+                losses = self._losses(minibatch)
                 results.append(losses.set("grad_norm", self.step(losses, minibatch)))
         with torch.no_grad():
             means: TensorDictBase = torch.stack(results).mean(dim=0)
@@ -125,6 +125,15 @@ class OnPolicy(GradientAlgorithm):
         if self._target_kl is not None:
             self._adapt(metrics["kl_approx"] / self._target_kl)
         return metrics
+
+    def _losses(self, minibatch: TensorDictBase) -> TensorDictBase:
+        """Return losses, with those of the mirror images in equal parts, and figures about the frames themselves."""
+        if self._mirror is None:
+            return cast("TensorDictBase", self.loss(minibatch))
+        own = minibatch.exclude("image")
+        losses, others = (self.loss(each) for each in (own, own.copy().update(minibatch.get("image"))))
+        both = {key: (value + others.get(key)) / 2 for key, value in losses.items() if key.startswith("loss_")}
+        return cast("TensorDictBase", losses.update(both))
 
     def _adapt(self, share: float) -> None:
         """Change the learning rate, after this share of the way that the policy should have gone."""

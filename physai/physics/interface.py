@@ -17,8 +17,8 @@ substeps, a gain g is a motor with the time constant (1 - g) / g, in control per
 
 Joints that are springs have, in the place of that gain, ``stiffness`` (N·m/rad) and ``servo_damping`` (N·m·s/rad). A
 robot whose base floats has ``floor_friction`` (a coefficient, 1), ``contact_time`` (of contacts with the floor: the
-time constant with which what has sunk in is pushed out, s, 1) and ``center_of_mass`` (of the base: how far it is from
-where the description has it, m, in the base's frame, 3)."""
+time constant with which what has sunk in is pushed out, s, 1; MuJoCo's have two of its steps at least), and
+``center_of_mass`` (of the base: how far it is from where the description has it, m, in the base's frame, 3)."""
 
 
 def nominal_dynamics(spec: RobotSpec) -> DynamicsParameters:

@@ -81,7 +81,7 @@ _LOWEST = {
     "link_mass": 1e-3,
     "velocity_gain": 1e-3,
     "stiffness": 1e-3,
-    "contact_time": 1e-3,
+    "contact_time": 1e-3,  # engines may have more
     "center_of_mass": -math.inf,
     "encoder_offset": -math.inf,
 }  # and zero for the others
@@ -140,7 +140,8 @@ class RandomizationConfig(Config):
             for name, draw in self.of(layout).draws.items()
             if draw.operation == "scale" and not layout.nominal[layout.columns[name]].any()
         }
-        return scaled | {name: "this engine cannot change it" for name in layout.ignored if name in self.draws}
+        ignored = [name for name in layout.ignored if name in layout.columns and name in self.draws]
+        return scaled | dict.fromkeys(ignored, "this engine cannot change it")
 
     def check(self, layout: ParameterLayout) -> None:
         """Raise a UserError if a list has not one value for each column of its parameter."""

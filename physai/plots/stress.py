@@ -20,6 +20,7 @@ _UNITS = {
     "encoder_offset": "rad",
     "position_noise": "rad",
     "velocity_noise": "rad/s",
+    "center_of_mass": "m",
     "push": "m/s",
     "motor_time_constant": "s",
 }

@@ -36,20 +36,25 @@ class Mirror:
         places, jacobian = ends_at_home(spec)  # [e, 3], [e, 3, n]
         image, moves = places * _ACROSS, jacobian * _ACROSS[:, np.newaxis]
         ends = np.linalg.norm(image[:, np.newaxis] - places, axis=2)  # [e of the image, e]
-        other = ends.argmin(axis=0)  # which end of the robot each end of the image is
+        other = ends.argmin(axis=0)  # which end of the image is at each end of the robot
         if ends.min(axis=0).max() > _NEAR:
             raise UserError(f"robot '{spec.name}': its feet on the left are not where those on the right are")
         n = len(spec.joints)
         off = np.zeros((2, n, n))  # for each sign: how far joint k is from being joint j of the image, [k, j]
         for number, sign in enumerate((1.0, -1.0)):
             off[number] = np.abs(moves[other][:, :, np.newaxis] - sign * jacobian[..., np.newaxis]).max(axis=(0, 1))
-        best = off.min(axis=0)
+        best, rows = off.min(axis=0), np.arange(n)
         order = best.argmin(axis=1)
-        sign = np.where(off[0] <= off[1], 1.0, -1.0)[np.arange(n), order]
-        same_home = np.abs(sign * spec.home[order] - spec.home) < _NEAR
-        if best.min(axis=1).max() > _NEAR or len(set(order.tolist())) < n or not same_home.all():
-            worst = spec.joints[int(np.where(same_home, best.min(axis=1), np.inf).argmax())]
-            raise UserError(f"robot '{spec.name}': no joint on its other side moves as {worst} does")
+        sign = np.where(off[0] <= off[1], 1.0, -1.0)[rows, order]
+        for joint, other_joint in enumerate(order):
+            name, like = spec.joints[joint], spec.joints[other_joint]
+            if best[joint, other_joint] > _NEAR or (order == other_joint).sum() > 1:
+                raise UserError(f"robot '{spec.name}': no joint on its other side moves as {name} does")
+            if abs(sign[joint] * spec.home[other_joint] - spec.home[joint]) > _NEAR:
+                raise UserError(f"robot '{spec.name}': at home {name} is not where {like} is on the other side")
+            for what, values in _drives(spec).items():
+                if not np.isclose(values[joint], values[other_joint]):
+                    raise UserError(f"robot '{spec.name}': {name} and {like} have not the same {what}")
         return cls(order, sign)
 
     def links(self, spec: RobotSpec) -> np.ndarray:
@@ -60,3 +65,10 @@ class Mirror:
         places = np.arange(len(names))
         places[of_joint] = np.array(of_joint)[self.order]
         return places
+
+
+def _drives(spec: RobotSpec) -> dict[str, np.ndarray]:
+    """What the joints of a pair must have alike, [n] each."""
+    assert spec.servo is not None
+    servo = {"stiffness": spec.servo.stiffness, "damping": spec.servo.damping}
+    return {"command_limit": spec.command_limit, "effort limit": spec.effort_limit, **servo}

@@ -56,10 +56,11 @@ class Axis:
             raise UserError(f"there is no axis '{name}'{nearest(name, axes)}")
         axis = cls(name, axes[name].operation, *axes[name].range)
         robot = RobotSpec.from_config(config.robot)
-        if axis.randomizes and name in config.ignored:
-            raise UserError(f"the axis '{name}' needs another engine: {config.physics['_target_']} cannot change it")
         if axis.randomizes and name not in ParameterLayout(robot).columns:
             raise UserError(f"the axis '{name}' is not one of robot '{robot.name}', which has no such parameter")
+        if name in config.ignored:
+            engine = config.physics["_target_"].rpartition(".")[2]
+            raise UserError(f"the axis '{name}' needs another engine: {engine} cannot change it")
         if name == "motor_time_constant" and config.physics.get("motor") != "servo":
             raise UserError(f"the axis '{name}' needs physics=mujoco physics.motor=servo")
         if axis.whole and not (float(axis.low).is_integer() and float(axis.high).is_integer()):

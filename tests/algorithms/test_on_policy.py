@@ -191,9 +191,9 @@ def test_with_symmetry_each_minibatch_comes_with_its_mirror_image():
     algorithm, seen = assemble(node, actor, critic, 32, mirror=mirror), []
     algorithm.loss.register_forward_pre_hook(lambda _, given: seen.append(given[0].clone()))
     algorithm.update(batch)
-    assert len(seen) == 4 * node.epochs
-    for given in seen:
-        own, image = given.split(8)
+    assert len(seen) == 2 * 4 * node.epochs
+    for own, image in zip(seen[::2], seen[1::2], strict=True):
+        assert len(own) == 8
         for name in ("x", "latent_action"):
             assert torch.equal(image[name], -own[name])
         for name in ("advantage", "action_log_prob", "value_target"):
@@ -201,7 +201,7 @@ def test_with_symmetry_each_minibatch_comes_with_its_mirror_image():
 
 
 def test_there_is_no_symmetry_without_legs_and_none_with_a_memory():
-    with pytest.raises(UserError, match="robot 'planar_arm' stands on no legs: it has no other side"):
+    with pytest.raises(UserError, match=r"algo\.symmetry: robot 'planar_arm' stands on no legs: it has no other side"):
         Agent.build(validate(TrainConfig, compose("train", ["algo.symmetry=true"])))
     with pytest.raises(UserError, match=r"algo\.symmetry: what an actor remembers has no mirror image"):
         Agent.build(validate(TrainConfig, compose("train", ["algo.symmetry=true", "policy=gru"])))

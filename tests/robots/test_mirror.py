@@ -26,6 +26,23 @@ def test_of_an_a1_the_legs_are_swapped_and_hips_turn_the_other_way(env_config):
 def test_what_has_no_mirror_image_is_refused_by_name(reacher, env_config):
     with pytest.raises(UserError, match="stands on no legs"):
         Mirror.of(RobotSpec.from_config(reacher.robot))
-    crooked = env_config("a1_walk", "env.robot.home=[0.2,0.8,-1.6,0,0.8,-1.6,0,0.8,-1.6,0,0.8,-1.6]")
-    with pytest.raises(UserError, match=r"its feet on the left are not|no joint on its other side"):
-        Mirror.of(RobotSpec.from_config(crooked.robot))
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ("home=[0.2,0.8,-1.6,0,0.8,-1.6,0,0.8,-1.6,0,0.8,-1.6]", "its feet on the left are not where"),
+        (
+            "command_limit=[0.4,0.7,0.7,0.5,0.7,0.7,0.4,0.7,0.7,0.4,0.7,0.7]",
+            "FR_hip_joint and FL_hip_joint have not the",
+        ),
+        (
+            "servo.stiffness=[80,80,80,80,80,70,80,80,80,80,80,80]",
+            "FR_lower_joint and FL_lower_joint have not the same",
+        ),
+    ],
+)
+def test_a_robot_whose_sides_differ_is_refused_in_one_line(env_config, change, said):
+    spec = RobotSpec.from_config(env_config("a1_walk", f"env.robot.{change}").robot)
+    with pytest.raises(UserError, match=said):
+        Mirror.of(spec)

@@ -55,6 +55,7 @@ def test_every_axis_of_the_config_can_be_made_and_every_parameter_that_is_drawn_
         ("link_mass", ["axes.link_mass.range=[0,2]"], "axes.link_mass.range: a scale must be above zero"),
         ("link_mass", ["axes.link_mass.range=[2,3]"], "axes.link_mass.range: 1, the robot as described, must be"),
         ("actuator_delay", ["axes.actuator_delay.range=[0,1.5]"], "axes.actuator_delay.range: whole control steps"),
+        ("contact_time", [], "the axis 'contact_time' is not one of robot 'planar_arm', which has no such parameter"),
         ("push", [], "the axis 'push' is not one of robot 'planar_arm', which has no such parameter"),
         ("link_mass", ["axes.link_mass.range=[2,0.5]"], "axes.link_mass.range: the first of [2.0, 0.5] must be below"),
         ("payload", ["axes.payload.range=[-1,1]"], "axes.payload.range: the first of [-1.0, 1.0] must be below the"),
@@ -65,6 +66,12 @@ def test_what_makes_no_sense_is_refused_in_one_line(axis, name, overrides, said)
         axis(name, *overrides)
     assert said in str(error.value)
     assert "\n" not in str(error.value)
+
+
+def test_what_the_engine_cannot_change_is_no_axis(env_config):
+    legged, axes = env_config("a1_walk"), settings().axes
+    with pytest.raises(UserError, match="the axis 'contact_time' needs another engine: PyBulletPhysics cannot change"):
+        Axis.make("contact_time", axes, legged)
 
 
 @pytest.mark.parametrize("name", sorted(set(RandomizationConfig.model_fields) - {"name"}))
