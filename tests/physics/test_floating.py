@@ -123,7 +123,7 @@ def test_in_mujoco_feet_sink_into_a_softer_floor(legged):
     physics.reset(np.arange(len(times)), at_home(legged, len(times)), parameters)
     state = stand(physics, legged, 2.0)
     assert state.contact[:, feet].all()
-    assert (np.diff(state.base_pose[:, 2]) < -1e-3).all()
+    assert (np.diff(state.base_pose[:, 2]) < -2e-4).all()
     np.testing.assert_array_equal(physics.parameters()["contact_time"], parameters["contact_time"])
 
 
@@ -143,7 +143,7 @@ def test_a_base_with_another_centre_of_mass_moves_in_mujoco_as_if_it_were_descri
     moved, told = stand(given, legged, 0.4), stand(expected, legged, 0.4)
     np.testing.assert_allclose(moved.joint_position, told.joint_position, atol=1e-9)
     np.testing.assert_allclose(moved.base_pose, told.base_pose, atol=1e-9)
-    assert np.abs(moved.joint_effort - before.joint_effort).max() > 0.5
+    assert np.abs(moved.joint_effort - before.joint_effort).max() > 0.05 * np.abs(before.joint_effort).max()
     np.testing.assert_allclose(given.parameters()["center_of_mass"], shift[None], atol=1e-12)
 
 
