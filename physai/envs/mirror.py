@@ -21,7 +21,7 @@ class MirrorImage:
     """Turns frames into those of the mirror image: left is right, and a gait is half a period on.
 
     What is sensed is mirrored by what it is, and the task's module makes the observation of that anew, which is
-    normalized with the statistics of now. Where the base's centre of mass is off its middle, as described, is not.
+    normalized with the statistics of now. A centre of mass that the description has off the middle stays there.
 
     Args:
         simulation: Of whose robots the frames are.
