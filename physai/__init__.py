@@ -2,10 +2,12 @@
 
 Importing it registers an id for each file of ``conf/env`` with Gymnasium, where that is installed, such as
 ``physai/PandaReach-v0``, one with exchangeable goals, ``physai/PandaReachGoal-v0``, and ``physai/RosReach-v0`` for the
-robot of any of these files behind ROS topics. It imports nothing heavy.
+robot of any of these files behind ROS topics. It also sets how Ray behaves, where nothing else is said. It imports
+nothing heavy.
 """
 
 import importlib.util
+import os
 from typing import TYPE_CHECKING, Any
 
 from physai.errors import UserError
@@ -15,6 +17,14 @@ if TYPE_CHECKING:
 
 __version__ = "0.1.0"
 __all__ = ["UserError", "make_env"]
+
+# Ray reads these when it is imported, which importing TorchRL does.
+os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # it would report its use to its makers
+# Its processes would be nice (15) to all others, and the learner, which waits for them, with them: where two other
+# processes compute, they took five minutes to start.
+os.environ.setdefault("RAY_worker_niceness", "0")
+# Of a computer that is gone, it prints the last lines of its log; physai says so in one line.
+os.environ.setdefault("RAY_DEDUP_LOGS_SKIP_REGEX", "^(Raylet is terminated|The node with node id)")
 
 _GYMNASIUM_IDS = {
     "Reacher": "reacher",

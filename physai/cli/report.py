@@ -1,7 +1,6 @@
 """The end of a sweep: one table of all its runs, one plot, and no failure unseen."""
 
 import json
-import os
 import signal
 import sys
 from pathlib import Path
@@ -23,7 +22,6 @@ class SweepReport(Callback):
         """Start Ray where it is the launcher; by itself it would also take over what this command does on a signal."""
         if not config.hydra.launcher._target_.endswith(".RayLauncher"):
             return
-        os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # Ray would report its use to its makers
         import ray
 
         arguments = OmegaConf.to_container(config.hydra.launcher.ray.init, resolve=True)

@@ -11,13 +11,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # Ray would report its use to its makers
-# Ray's processes would be nice (15) to all others, and the learner, which waits for them, with them: where two other
-# processes compute, they took five minutes to start.
-os.environ.setdefault("RAY_worker_niceness", "0")
-# Of a computer that is gone, Ray prints the last forty lines of its log; here, one line says so.
-os.environ.setdefault("RAY_DEDUP_LOGS_SKIP_REGEX", "^(Raylet is terminated|The node with node id)")
-
 import ray
 from ray.exceptions import RayError, RayTaskError
 from tensordict import TensorDictBase

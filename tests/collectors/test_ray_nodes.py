@@ -4,6 +4,7 @@ The second computer is a mount namespace, in which the checkout is not there. Wh
 sight of what a cluster does: that robots are built from what the wheel holds, and that one may lose a computer.
 """
 
+import contextlib
 import os
 import signal
 import socket
@@ -98,10 +99,18 @@ class Computers:
 
 def _cut_power(computer: "subprocess.Popen[str]") -> None:
     started = {computer.pid, *descendants(computer.pid)}
-    for process in started:
-        os.kill(process, signal.SIGKILL)
+    raylets = {process for process in started if "/raylet " in command_of(process)}
+    _kill(raylets)
+    time.sleep(1)  # in which what is left of Ray there tells the learner, with the last lines of the raylet's log
+    _kill(started - raylets)
     computer.communicate()
     assert all_gone(started)
+
+
+def _kill(processes: set[int]) -> None:
+    for process in processes:
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(process, signal.SIGKILL)
 
 
 def _start(program: list[str], cwd: Path) -> "subprocess.Popen[str]":
