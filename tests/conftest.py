@@ -7,7 +7,7 @@ import signal
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import redirect_stdout
-from functools import cache, partial
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,12 +22,13 @@ from hydra.core.global_hydra import GlobalHydra
 from hypothesis import HealthCheck, settings
 from omegaconf import OmegaConf
 
-from physai.compose import compose, conf_dir
+from physai.compose import conf_dir
 from physai.config import validate
 from physai.deploy import Policy, load_policy
 from physai.envs.simulation import EnvConfig
 from physai.training.config import TrainConfig
 from physai.training.run import load_config, run_training
+from tests import composed
 from tests.forge import close_forges
 from tests.training.small import SMALL, TINY, command, run_here
 
@@ -94,39 +95,34 @@ def _one_thread():
     torch.set_num_threads(1)
 
 
-@cache  # to compose a config takes a fifth of a second
-def _env_config(name: str, *overrides: str) -> EnvConfig:
-    return validate(EnvConfig, compose("train", [f"env={name}", *overrides]).env)
-
-
 @pytest.fixture(scope="session")
 def env_config() -> Callable[..., EnvConfig]:
     """Compose the config of an env by name: ``env_config("reacher", "env.task.max_steps=5")``."""
-    return _env_config
+    return composed.env_config
 
 
 @pytest.fixture(scope="session")
 def reacher() -> EnvConfig:
-    return _env_config("reacher")
+    return composed.env_config("reacher")
 
 
 _ENVS = sorted(path.stem for path in (conf_dir() / "env").glob("*.yaml"))  # what is added there is tested, too
-_SIMULATED_ENVS = [name for name in _ENVS if _env_config(name).simulated]
+_SIMULATED_ENVS = [name for name in _ENVS if composed.env_config(name).simulated]
 
 
 @pytest.fixture(scope="session")
 def kuka_reacher() -> EnvConfig:
-    return _env_config("kuka_reacher")
+    return composed.env_config("kuka_reacher")
 
 
 @pytest.fixture(scope="session", params=["reacher", "kuka_reacher"])
 def two_joint_env(request: pytest.FixtureRequest) -> EnvConfig:
     """The environments whose arm drives two joints, in turn."""
-    return _env_config(request.param)
+    return composed.env_config(request.param)
 
 
 def _first_of_each_robot(floats: bool) -> list[str]:
-    configs = {name: _env_config(name).robot for name in reversed(_SIMULATED_ENVS)}
+    configs = {name: composed.env_config(name).robot for name in reversed(_SIMULATED_ENVS)}
     robots = {robot.name: name for name, robot in configs.items() if (robot.floating is not None) == floats}
     return sorted(robots.values())
 
@@ -134,19 +130,19 @@ def _first_of_each_robot(floats: bool) -> list[str]:
 @pytest.fixture(scope="session", params=_first_of_each_robot(floats=False))
 def any_arm(request: pytest.FixtureRequest) -> EnvConfig:
     """An environment of each robot whose base is fixed, in turn."""
-    return _env_config(request.param)
+    return composed.env_config(request.param)
 
 
 @pytest.fixture(scope="session", params=_first_of_each_robot(floats=True))
 def any_legged(request: pytest.FixtureRequest) -> EnvConfig:
     """An environment of each robot whose base floats, in turn."""
-    return _env_config(request.param)
+    return composed.env_config(request.param)
 
 
 @pytest.fixture(scope="session", params=_SIMULATED_ENVS)
 def any_env(request: pytest.FixtureRequest) -> EnvConfig:
     """Each environment in turn."""
-    return _env_config(request.param)
+    return composed.env_config(request.param)
 
 
 @pytest.fixture(scope="session")
@@ -177,7 +173,7 @@ def exported_run(once: Callable[[str, Callable[[Path], None]], Path]) -> Path:
 
     It is not to be written to.
     """
-    return once("exported_run", partial(_train_and_export, "total_frames=120_000"))
+    return once("exported_run", partial(_train_and_export, "total_frames=80_000"))
 
 
 @pytest.fixture(scope="session")
@@ -221,7 +217,7 @@ def walking_policy(walking_run: Path) -> Policy:
 
 def _train_and_export(*arguments: Any) -> None:
     *overrides, run = arguments
-    node = compose("train", [*overrides, "evaluation.episodes=200", "evaluation.in_a_row=2"])
+    node = composed.composed(*overrides, "evaluation.episodes=200", "evaluation.in_a_row=2")
     (run / ".hydra").mkdir()
     (run / ".hydra" / "config.yaml").write_text(OmegaConf.to_yaml(node))
     run_training(validate(TrainConfig, node), run)

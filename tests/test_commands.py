@@ -352,6 +352,7 @@ def test_plot_overlays_runs(run, copied, tmp_path):
     assert (tmp_path / "both.png").read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "module", ["train", "search", "evaluate", "export", "play", "plot", "stress", "identify", "capsules"]
 )

@@ -15,6 +15,7 @@ from physai.errors import UserError
 from physai.policies import GaussianActor
 from physai.training.agent import Agent
 from physai.training.config import TrainConfig
+from tests.composed import composed
 
 SMALL = ("collector.num_envs=4", "collector.frames_per_batch=64")
 
@@ -50,7 +51,7 @@ BESIDE = {  # what a choice of these is made with
 
 def small(*overrides: str, teacher: Callable[[], Path] | None = None) -> TrainConfig:
     """A config of few robots and small batches, with a teacher where one is missing."""
-    node = compose("train", [*overrides, *SMALL])  # a sixth of a second; once will do
+    node = composed(*overrides, *SMALL)
     if "minibatch_size" in node.algo:
         node.algo.minibatch_size = 32
     if teacher is not None and OmegaConf.is_missing(node.algo, "teacher"):
@@ -79,7 +80,7 @@ def test_every_choice_builds_and_collects(override, request):
 
 def without_servo(robot: str) -> bool:
     """Whether the joints of a robot are no springs, which take positions only."""
-    return compose("train", [f"robot@env.robot={robot}"]).env.robot.servo is None
+    return composed(f"robot@env.robot={robot}").env.robot.servo is None
 
 
 @pytest.mark.slow

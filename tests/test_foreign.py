@@ -95,6 +95,7 @@ def test_resuming_a_run_from_elsewhere_executes_nothing(run, capsys, case):
     refused(capsys, train._resume, run, ["seed=0"])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", malicious.PLOT)
 def test_drawing_a_run_from_elsewhere_executes_nothing(run, capsys, case):
     malicious.edit(run, malicious.PLOT[case])

@@ -315,6 +315,7 @@ def test_a_reward_that_is_not_a_number_stops_before_the_step_and_hands_over_the_
     assert all(torch.equal(before[key], after[key]) for key in before)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [

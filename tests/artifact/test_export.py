@@ -84,7 +84,7 @@ def test_the_metadata_says_everything_a_robot_must_know(exported_run):
     }
     urdf = Path(physai.__path__[0]) / "robots" / "assets" / "planar_arm.urdf"
     assert raw["robot"]["urdf_sha256"] == hashlib.sha256(urdf.read_bytes()).hexdigest()
-    assert raw["config"]["total_frames"] == 120_000
+    assert raw["config"]["total_frames"] == 80_000
     low, high = raw["evaluation"]["success_ci"]
     assert low <= raw["evaluation"]["success_rate"] <= high
     assert raw["evaluation"]["episodes"] == 200

@@ -6,7 +6,6 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictSequential
 
 from physai.artifact.module import make_deployable, save, script
-from physai.compose import compose
 from physai.config import validate
 from physai.deploy.archive import content_sha256
 from physai.envs.make import make
@@ -14,11 +13,12 @@ from physai.errors import UserError
 from physai.training.agent import make_actor
 from physai.training.config import TrainConfig
 from physai.transforms import RunningStatistics
+from tests.composed import composed
 from tests.training.small import SMALL
 
 
 def untrained(*overrides, num_envs=4):
-    config = validate(TrainConfig, compose("train", [*SMALL, *overrides]))
+    config = validate(TrainConfig, composed(*SMALL, *overrides))
     given = [one for one in overrides if one.startswith("env.")]
     env = make(config.env.name, num_envs, overrides=["randomization=none", *given])
     RunningStatistics(env.normalizer, 0.01).update(
@@ -44,6 +44,7 @@ def test_scripted_and_eager_agree_to_the_last_bit(env, rows):
     env.close()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "in_keys",
     ["observation", "features", "normalized_observation", "features,observation", "observation,features"],

@@ -12,6 +12,7 @@ from physai.errors import UserError
 from tests.collectors.parts import assert_equal
 
 
+@pytest.mark.slow
 def test_batches_are_robots_by_steps_and_no_two_robots_are_alike(collect):
     source, *_ = collect("multi_sync", total=300)
     batches = [batch.clone() for batch in source]
@@ -24,6 +25,7 @@ def test_batches_are_robots_by_steps_and_no_two_robots_are_alike(collect):
         assert torch.equal(before["next", "observation"][:, -1][goes_on], after["observation"][:, 0][goes_on])
 
 
+@pytest.mark.slow
 def test_all_processes_see_the_learner_s_weights_and_normalization_from_the_next_batch_on(collect):
     source, actor, normalization = collect("multi_sync")
     batches = iter(source)

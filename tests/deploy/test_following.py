@@ -8,13 +8,12 @@ import numpy as np
 import pytest
 import torch
 
-from physai.compose import compose
-from physai.config import validate
 from physai.deploy import Controller, ControllerConfig, Goal, JointState, State
 from physai.deploy.following import Following
-from physai.physics import ParameterLayout, RandomizationConfig, RobotState
+from physai.physics import ParameterLayout, RobotState
 from physai.physics.pybullet import PyBulletPhysics
 from physai.robots import RobotSpec
+from tests import composed
 from tests.deploy.troubled import Troubled
 
 PERIOD = 0.02
@@ -289,7 +288,7 @@ def simulate(policy, reacher, robots, seconds, randomization, seed, change=None)
     """Let simulated robots pursue goal after goal; return their controllers."""
     spec = RobotSpec.from_config(reacher.robot)
     layout = ParameterLayout(spec)
-    draws = validate(RandomizationConfig, compose("train", [f"randomization={randomization}"]).randomization)
+    draws = composed.randomization(randomization)
     rows = draws.sample(robots, layout, torch.Generator().manual_seed(seed)).numpy()
     dynamics, draw = layout.dynamics(rows), np.random.default_rng(seed)
     offset, shaky, jerky, delay = (

@@ -6,11 +6,8 @@ import torch
 from torch import Tensor
 
 from physai.collision import Box
-from physai.compose import compose
-from physai.config import validate
 from physai.deploy import Controller, ControllerConfig, Goal, JointState, State, load_policy
 from physai.deploy.guard import CollisionGuard
-from physai.envs.simulation import EnvConfig
 from physai.errors import UserError
 from physai.physics import RobotState
 from physai.physics.mujoco import MuJoCoPhysics
@@ -18,6 +15,7 @@ from physai.physics.shapes import ShapeCollisions
 from physai.robots import RobotSpec
 from physai.signals import Box as Bounds
 from physai.signals import Quantity, Tolerance
+from tests.composed import env_config
 from tests.deploy.scripted import of_joints, policy_file
 
 DT = 0.02
@@ -37,7 +35,7 @@ class GoesStraight(torch.nn.Module):
 
 @pytest.fixture(scope="module")
 def panda() -> RobotSpec:
-    return RobotSpec.from_config(validate(EnvConfig, compose("train", ["env=panda_reach"]).env).robot)
+    return RobotSpec.from_config(env_config("panda_reach").robot)
 
 
 @pytest.fixture(scope="module")

@@ -91,6 +91,7 @@ def test_robots_that_take_positions_go_as_fast_as_those_that_take_velocities(mak
     assert (behind <= limit / env.simulation.spec.position_gain + 1e-3).all()  # by its servo's time at most
 
 
+@pytest.mark.slow
 @BOTH
 @pytest.mark.parametrize("name", ["reacher", "kuka_reacher"])
 def test_a_command_moves_the_robot_exactly_as_many_steps_late_as_its_delay(make, command, name):

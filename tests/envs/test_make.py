@@ -125,6 +125,7 @@ def test_rows_that_were_never_reset_go_the_same_way_whatever_happens_to_the_othe
         assert torch.equal(td["reward"][kept], quiet_td["reward"][kept])
 
 
+@pytest.mark.slow
 @parametrized
 def test_a_rollout_of_staggered_episodes_is_consistent(make_env, name, randomization):
     env = make_env(name, randomization, overrides=["env.task.max_steps=13", "env.task.tolerance=0.1"])
@@ -259,6 +260,7 @@ def test_make_env_works_as_the_readme_shows():
     env.close()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("override", "words"),
     [

@@ -5,13 +5,11 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from physai.compose import compose
-from physai.config import validate
 from physai.envs.mirror import MirrorImage
 from physai.envs.simulation import Simulation
-from physai.physics import RandomizationConfig
 from physai.robots import Mirror
 from physai.transforms.normalization import Normalizer
+from tests.composed import randomization
 
 ROBOTS = 8
 
@@ -35,7 +33,7 @@ def image_of(simulation, **frames):
 
 def test_robots_that_are_mirrored_and_told_the_mirrored_move_as_the_mirror_image(pair):
     robots, others = pair
-    draws = validate(RandomizationConfig, compose("train", []).randomization)
+    draws = randomization("default")
     parameters = draws.sample(ROBOTS, robots.layout, torch.Generator().manual_seed(0)).numpy()
     columns = robots.layout.columns
     parameters[:, columns["push"]] = 0.0

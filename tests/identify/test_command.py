@@ -10,11 +10,12 @@ from physai.bench.hidden import NOISE, record, write_table
 from physai.compose import compose
 from physai.config import validate
 from physai.physics import RandomizationConfig
+from tests.composed import randomization
 
 
 @pytest.fixture(scope="module")
 def hidden(env_config):
-    draws = validate(RandomizationConfig, compose("train", ["randomization=strong"]).randomization)
+    draws = randomization("strong")
     return record(env_config("reacher", "physics=mujoco"), draws, ["velocity_gain"], 10.0, 2)
 
 

@@ -7,19 +7,17 @@ import numpy as np
 import pytest
 
 from physai.bench.hidden import NOISE, record
-from physai.compose import compose
-from physai.config import validate
 from physai.identify.fit import Predictor, fit
 from physai.identify.trials import cut
 from physai.identify.unknowns import Unknowns
-from physai.physics import RandomizationConfig
+from tests.composed import randomization
 
 ALL = ["link_mass", "payload", "joint_damping", "joint_friction", "velocity_gain"]
 
 
 @pytest.fixture(scope="module")
 def strong():
-    return validate(RandomizationConfig, compose("train", ["randomization=strong"]).randomization)
+    return randomization("strong")
 
 
 def found(hidden, physics, names, longest=4):

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from omegaconf import OmegaConf
 
-from physai.compose import compose
 from physai.config import validate
 from physai.identify.fit import SPREAD, Fit
 from physai.identify.randomization import FLOOR, identified, text
 from physai.identify.unknowns import Unknowns
 from physai.physics import ParameterLayout, RandomizationConfig
 from physai.robots import RobotSpec
+from tests.composed import randomization
 
 NAMES = ["link_mass", "payload", "joint_friction", "velocity_gain"]
 
@@ -29,7 +29,7 @@ def layout(planar):
 
 @pytest.fixture(scope="module")
 def base():
-    return validate(RandomizationConfig, compose("train").randomization)
+    return randomization("default")
 
 
 @pytest.fixture

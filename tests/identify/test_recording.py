@@ -6,19 +6,17 @@ import numpy as np
 import pytest
 
 from physai.bench.hidden import record, write_table
-from physai.compose import compose
-from physai.config import validate
 from physai.errors import UserError
 from physai.identify.recording import Recording, _on_grid, read
 from physai.identify.trials import cut
-from physai.physics import RandomizationConfig
+from tests.composed import randomization
 
 TOPIC = "/joint_velocity_controller/commands"
 
 
 @pytest.fixture(scope="module")
 def hidden(env_config):
-    draws = validate(RandomizationConfig, compose("train", ["randomization=none"]).randomization)
+    draws = randomization("none")
     return record(env_config("reacher", "physics=mujoco"), draws, [], 12.0, 0, feels=True)
 
 

@@ -9,11 +9,10 @@ import numpy as np
 import pytest
 import torch
 
-from physai.compose import compose
-from physai.config import validate
-from physai.physics import ParameterLayout, RandomizationConfig
+from physai.physics import ParameterLayout
 from physai.physics.mujoco import MuJoCoPhysics
 from physai.robots import RobotSpec
+from tests.composed import randomization
 from tests.physics.conftest import ENGINES, MOTOR
 from tests.physics.moving import DT, commands, dynamics, reset_all, resting, run, start, wild
 
@@ -65,8 +64,7 @@ def test_robots_go_where_they_go_in_pybullet(spec, kind, substeps):
 @pytest.mark.parametrize("name", ["none", "default", "strong"])
 def test_seven_joints_go_where_they_go_in_pybullet(seven, name):
     layout, generator = ParameterLayout(seven), torch.Generator().manual_seed(0)
-    randomization = validate(RandomizationConfig, compose("train", [f"randomization={name}"]).randomization)
-    parameters = layout.dynamics(randomization.sample(16, layout, generator).numpy())
+    parameters = layout.dynamics(randomization(name).sample(16, layout, generator).numpy())
     random = np.random.default_rng(0)
     assert apart(seven, start(seven, 16, random), parameters, wandering(seven, 16, random)) < 1e-3
 

@@ -3,15 +3,13 @@
 import pytest
 
 from physai import UserError
-from physai.compose import compose
-from physai.config import validate
-from physai.physics import RandomizationConfig
 from physai.plots.curriculum import plot_curriculum
+from tests.composed import randomization
 
 
 @pytest.fixture(scope="module")
 def wide():
-    return validate(RandomizationConfig, compose("train", ["randomization=wide"]).randomization)
+    return randomization("wide")
 
 
 def test_each_range_is_a_band_between_the_ends_that_it_can_reach(wide, tmp_path, drawn):

@@ -9,13 +9,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from physai.compose import compose
-from physai.config import validate
-from physai.envs.simulation import EnvConfig
 from physai.errors import UserError
 from physai.robots import RobotConfig, RobotSpec, engine_urdf
 from physai.robots.bodies import merge
 from physai.robots.urdf import load, transform
+from tests.composed import env_config
 from tests.physics.conftest import ENGINES
 
 LINK = (
@@ -27,7 +25,7 @@ triples = st.tuples(numbers, numbers, numbers)
 
 
 def config(env: str) -> RobotConfig:
-    return validate(EnvConfig, compose("train", [f"env={env}"]).env).robot
+    return env_config(env).robot
 
 
 @pytest.fixture(scope="module")

@@ -6,15 +6,13 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from physai.compose import compose
-from physai.config import validate
-from physai.envs.simulation import EnvConfig
 from physai.robots import JointCommand, RobotConfig, RobotSpec
 from physai.robots.command import LEAD
+from tests.composed import env_config
 
 DT = 0.02
 LIMIT = np.array([2.0, 0.5])
-CONFIG = validate(EnvConfig, compose("train", ["env=reacher"]).env).robot
+CONFIG = env_config("reacher").robot
 
 
 def command_of(kind: str) -> JointCommand:

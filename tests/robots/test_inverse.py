@@ -34,6 +34,7 @@ def test_nearly_all_poses_are_met_within_the_joints_limits(simulation, goals):
     assert ((found > low) & (found < high)).all()
 
 
+@pytest.mark.slow
 def test_nearly_all_of_its_configurations_touch_nothing(simulation, goals):
     assert (simulation.task.clearance(solved(simulation, goals).double().numpy()) > 0).mean() > 0.98
 

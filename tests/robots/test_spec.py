@@ -9,8 +9,9 @@ from physai.envs.simulation import EnvConfig
 from physai.errors import UserError
 from physai.robots import RobotConfig, RobotSpec
 from physai.signals import Quantity
+from tests.composed import env_config
 
-CONFIG = validate(EnvConfig, compose("train", ["env=reacher"]).env).robot
+CONFIG = env_config("reacher").robot
 
 
 def spec_of(**changes: object) -> RobotSpec:

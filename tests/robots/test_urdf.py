@@ -8,14 +8,12 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from physai.compose import compose
-from physai.config import validate
-from physai.envs.simulation import EnvConfig
 from physai.errors import UserError
 from physai.robots import RobotConfig, RobotSpec
 from physai.robots.urdf import resolve
+from tests.composed import env_config
 
-CONFIG = validate(EnvConfig, compose("train", ["env=reacher"]).env).robot
+CONFIG = env_config("reacher").robot
 TEXT = resolve(CONFIG.urdf).read_text()
 LINK2 = TEXT[TEXT.index('<link name="link2">') : TEXT.index('<joint name="tool_mount"')]
 

@@ -11,6 +11,7 @@ from physai.physics import ParameterLayout, RandomizationConfig
 from physai.robots import RobotSpec
 from physai.stress.__main__ import StressConfig
 from physai.stress.axes import Axis
+from tests.composed import randomization
 
 
 def settings(*overrides):
@@ -74,11 +75,12 @@ def test_what_the_engine_cannot_change_is_no_axis(env_config):
         Axis.make("contact_time", axes, legged)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(set(RandomizationConfig.model_fields) - {"name"}))
 def test_a_value_reaches_every_robot_and_leaves_the_other_draws_as_they_are(reacher, env_config, name):
     env = env_config("a1_walk", "physics=mujoco") if name in OF_LEGS else reacher
     layout = ParameterLayout(RobotSpec.from_config(env.robot))
-    config = validate(RandomizationConfig, compose("train", []).randomization)
+    config = randomization("default")
     drawn = Axis.make(name, settings().axes, env)
     value = drawn.values(3)[1]
     changed = config.model_copy(update={name: drawn.draw(value)})
@@ -92,7 +94,7 @@ def test_a_value_reaches_every_robot_and_leaves_the_other_draws_as_they_are(reac
 
 
 def test_the_range_of_the_training_is_that_of_its_randomization(axis, reacher):
-    config = validate(RandomizationConfig, compose("train", ["randomization=strong"]).randomization)
+    config = randomization("strong")
     assert axis("link_mass").trained(config, reacher) == (0.5, 2.0)
     assert axis("encoder_offset").trained(config, reacher) == (0.0, 0.02)
     assert axis("link_mass").trained(RandomizationConfig.none(), reacher) == (1.0, 1.0)

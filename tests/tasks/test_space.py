@@ -77,6 +77,7 @@ def test_the_error_of_a_position_is_the_distance(simulate):
     np.testing.assert_allclose(error[:, 0], np.linalg.norm(off, axis=1), rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_the_errors_of_a_pose_are_distance_and_angle_whichever_sign_its_quaternion_has(simulate):
     simulation = simulate("panda_pose")
     q = inside_of_limits(simulation, 20)

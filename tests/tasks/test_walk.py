@@ -140,6 +140,7 @@ def test_the_module_says_what_the_policy_sees_in_both_engines_and_scripts(simula
         env.close()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("overrides", "line"),
     [

@@ -15,6 +15,7 @@ from physai.training.agent import Agent
 from physai.training.callbacks import EvaluationCallback
 from physai.training.config import TrainConfig
 from physai.training.run import load_config, make_trainer, run_training
+from tests.composed import composed
 from tests.forge import Forked, forge_of
 
 SMALL = (
@@ -51,7 +52,7 @@ EXPORTED = "export.formats=[torchscript,onnx]"  # as by default
 
 
 def small_config(*overrides: str) -> TrainConfig:
-    return validate(TrainConfig, compose("train", [*SMALL, *overrides]))
+    return validate(TrainConfig, composed(*SMALL, *overrides))
 
 
 # What every command imports, which takes longer than most of them run.

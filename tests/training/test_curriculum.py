@@ -97,6 +97,7 @@ def test_a_randomization_in_which_nothing_can_grow_is_refused():
         Agent.build(small_config("randomization=none", "curriculum=adr"))
 
 
+@pytest.mark.slow
 def test_ranges_grow_linearly_from_the_robot_as_described_to_the_whole_randomization(tmp_path):
     """A whole run, two seconds: nothing else shows that frames move ranges, and that logs have them."""
     run_here(tmp_path / "run", *SMALL, "total_frames=4096", "randomization=strong", "curriculum=linear")

@@ -20,6 +20,7 @@ def of(teacher, *overrides):
     return (*STUDENT, f"algo.teacher={teacher}", *overrides)
 
 
+@pytest.mark.slow
 def test_the_teacher_sees_the_robots_parameters_and_says_what_it_would_do(teacher_run):
     agent = Agent.build(small_config(*of(teacher_run)))
     teacher = agent.algorithm.teacher

@@ -10,6 +10,7 @@ from physai.errors import UserError
 from physai.physics import ParameterLayout, RandomizationConfig
 from physai.robots import RobotSpec
 from physai.transforms import DomainRandomization
+from tests import composed
 
 NOTHING = dict.fromkeys(name for name in RandomizationConfig.model_fields if name != "name")
 
@@ -136,6 +137,7 @@ def test_successive_draws_differ(layout):
     assert not torch.isclose(transform.sample(50)[:, column], transform.sample(50)[:, column]).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["reacher", "kuka_reacher"])
 @pytest.mark.parametrize("randomization", ["none", "default", "strong"])
 def test_the_engine_runs_on_the_parameters_that_the_tensordict_shows(make_env, name, randomization):
@@ -148,7 +150,7 @@ def test_the_engine_runs_on_the_parameters_that_the_tensordict_shows(make_env, n
     for key, value in env.simulation.physics.parameters().items():
         expected = shown[:, layout.columns[key]].double().numpy()
         np.testing.assert_allclose(value, expected, rtol=1e-6, atol=1e-7, err_msg=key)
-    drawn = validate(RandomizationConfig, compose("train", [f"randomization={randomization}"]).randomization)
+    drawn = composed.randomization(randomization)
     for key, columns in layout.columns.items():
         differs = (shown[:, columns] != layout.nominal[columns]).any()
         assert bool(differs) == (key in drawn.draws and key not in drawn.without_effect(layout)), key

@@ -4,21 +4,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tensordict import TensorDict
 
-from physai.compose import compose
-from physai.config import validate
-from physai.envs.simulation import EnvConfig
-from physai.physics import ParameterLayout, RandomizationConfig
+from physai.physics import ParameterLayout
 from physai.robots import RobotSpec
 from physai.transforms import GrowingRandomization, Ranges
-
-
-def randomization(name):
-    return validate(RandomizationConfig, compose("train", [f"randomization={name}"]).randomization)
+from tests.composed import env_config, randomization
 
 
 @pytest.fixture(scope="module")
 def layout():
-    return ParameterLayout(RobotSpec.from_config(validate(EnvConfig, compose("train").env).robot))
+    return ParameterLayout(RobotSpec.from_config(env_config("reacher").robot))
 
 
 @pytest.fixture(scope="module")

@@ -18,6 +18,7 @@ from physai.web.appearance import robot_of
 from physai.web.scene import on_the_spot
 
 
+@pytest.mark.slow
 def test_any_arm_has_something_to_show_of_each_body_that_moves_and_its_tip_is_where_kinematics_say(any_arm):
     spec = RobotSpec.from_config(any_arm.robot)
     look = Appearance.of_robot(spec)
@@ -77,6 +78,7 @@ def test_a_policy_file_whose_urdf_is_elsewhere_is_drawn_by_what_it_tells(env_con
     assert (look.reach, look.floor) == (whole.reach, pytest.approx(whole.floor, abs=0.1))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("env", ["reacher", "xarm_reach", "panda_pose"])
 def test_a_goal_that_is_dragged_is_told_as_the_task_has_it(env_config, env):
     simulation = Simulation(env_config(env, "physics=mujoco"), 1, 0)
