@@ -21,6 +21,7 @@ LARGEST_DROP = 0.01  # of the success rate, from the engine of the training to t
 _SPEED, _STEPS = 0.5, 25  # of the largest command, and for how long each joint is moved
 _SOON = 8  # control steps, after which it shows what little effort does
 _LATE = 2  # control steps; a drive's time constant takes one
+_ROTOR = 0.01  # kg·m², of a drive
 _SCALES = 0.5 ** np.arange(24)  # of the effort limit
 
 
@@ -44,6 +45,7 @@ class Opinion:
 
     Attributes:
         physics: The engine, as ``conf/physics`` names one.
+        armature: Of the robots there, kg·m²: a drive has rotors, PyBullet has none.
         evaluation: Of the policy there.
         differences: What an arm does otherwise there, a line each.
         episodes: How many goals there were.
@@ -51,6 +53,7 @@ class Opinion:
     """
 
     physics: dict[str, Any]
+    armature: float
     evaluation: Evaluation
     differences: list[str]
     episodes: int
@@ -60,6 +63,7 @@ class Opinion:
         """The figures, for the files."""
         return {
             "physics": self.physics,
+            "armature": self.armature,
             **self.evaluation.summary(),
             "episodes": self.episodes,
             "randomization": self.randomization,
@@ -97,10 +101,13 @@ def ask(content: bytes, policy: DeployablePolicy, trained: TrainedPolicy, episod
     """
     config, physics = trained.config.env, other_engine(trained.config.env.physics)
     found = differences(config, physics) if config.robot.floating is None else []  # one that floats turns itself, too
-    _, env = trained.deploy(min(episodes, MAX_ROBOTS), seed, config.model_copy(update={"physics": physics}))
+    rotor = _ROTOR if physics.get("motor") == "servo" and config.robot.servo is None else 0.0
+    robot = config.robot.model_copy(update={"armature": [rotor]})
+    other = config.model_copy(update={"physics": physics, "robot": robot})
+    _, env = trained.deploy(min(episodes, MAX_ROBOTS), seed, other)
     with closing(env):
         driven = drive(content, policy, env, episodes, seed)
-    return Opinion(physics, driven, found, episodes, trained.randomization.name)
+    return Opinion(physics, rotor, driven, found, episodes, trained.randomization.name)
 
 
 def differences(config: EnvConfig, other: dict[str, Any]) -> list[str]:
@@ -118,12 +125,9 @@ def differences(config: EnvConfig, other: dict[str, Any]) -> list[str]:
     Returns:
         One line a difference.
     """
-    engines = (
-        {key: 0.0 if key == "armature" else value for key, value in one.items()} for one in (config.physics, other)
-    )
-    floating = config.robot.model_copy(update={"gravity": [0.0, 0.0, 0.0]})
+    floating = config.robot.model_copy(update={"gravity": [0.0, 0.0, 0.0], "armature": [0.0]})
     (own, own_onset, own_weak), (moved, onset, weak) = (
-        _respond(config.model_copy(update={"physics": engine, "robot": floating})) for engine in engines
+        _respond(config.model_copy(update={"physics": engine, "robot": floating})) for engine in (config.physics, other)
     )
     joints, lines = config.robot.joints, []
     moves = np.abs(moved).argmax(axis=1)

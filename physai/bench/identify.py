@@ -11,18 +11,31 @@ from rich.table import Table
 
 from physai.bench.hidden import NOISE, Hidden, record
 from physai.bench.timing import config_of, table
+from physai.compose import cores
 from physai.envs.simulation import EnvConfig
 from physai.identify.fit import Fit, Predictor, fit
 from physai.identify.trials import cut
 from physai.identify.unknowns import Unknowns
+from physai.physics import ParameterLayout
+from physai.robots import RobotSpec
 
-ROBOTS = 20
+ROBOTS, DRIVES = 20, 6  # of which a fit takes ten times as long
 SECONDS = 30.0
 DELAYS = 4
 UNKNOWNS = ["link_mass", "payload", "joint_damping", "joint_friction", "velocity_gain"]
 WITH_EFFORTS = [*UNKNOWNS, "effort_limit"]
 ENGINE = "physics=mujoco"
-OTHER = (ENGINE, "physics.motor=servo", "physics.armature=0.01")  # rotors that the engine of the fit does not know
+PYBULLET = ("physics=pybullet",)
+DRIVE = (ENGINE, "physics.motor=servo")
+ROTORS = (*DRIVE, "env.robot.armature=0.01")
+CASES = {  # how many, what they are, what they are taken for, what is looked for, and whether they tell efforts
+    "MuJoCo in MuJoCo": (ROBOTS, (ENGINE,), (ENGINE,), UNKNOWNS, False),
+    "the same, efforts": (ROBOTS, (ENGINE,), (ENGINE,), WITH_EFFORTS, True),
+    "PyBullet in MuJoCo": (ROBOTS, PYBULLET, (ENGINE,), UNKNOWNS, False),
+    "drives as PyBullet's motors": (ROBOTS, ROTORS, (ENGINE,), UNKNOWNS, False),
+    "drives as drives without rotors": (DRIVES, ROTORS, DRIVE, UNKNOWNS, False),
+    "drives, rotors looked for": (DRIVES, ROTORS, DRIVE, [*UNKNOWNS, "armature"], False),
+}
 
 
 @dataclass(frozen=True)
@@ -73,13 +86,15 @@ def identify(hidden: Hidden, config: EnvConfig, names: list[str]) -> Found:
 
     Args:
         hidden: The robot.
-        config: The env, and the engine to find it in.
+        config: The env: what the robot is taken for, and the engine to find it in.
         names: What is looked for.
     """
     started = time.perf_counter()
     trials = cut(hidden.recording, "robot", hidden.spec.joints)
-    unknowns = Unknowns.of(names, hidden.spec, hidden.layout)
-    with closing(Predictor(hidden.spec, config.physics, hidden.recording.period, trials)) as predict:
+    spec = RobotSpec.from_config(config.robot)
+    unknowns = Unknowns.of(names, spec, ParameterLayout(spec))
+    physics = config.physics | {"threads": cores()}
+    with closing(Predictor(spec, physics, hidden.recording.period, trials)) as predict:
         found = fit(predict, trials, unknowns, DELAYS, 0, lambda _: None)
     return Found(hidden, found, time.perf_counter() - started)
 
@@ -90,20 +105,15 @@ def run(options: Namespace) -> Table:
 
 
 def measure_identify(seed: int, robots: int = ROBOTS, seconds: float = SECONDS) -> dict[str, list[Found]]:
-    """Draw robots from ``randomization=strong``, and find them: without and with efforts, and in another engine."""
-    cases = {
-        "same engine": ((ENGINE,), UNKNOWNS, False),
-        "same engine, efforts": ((ENGINE,), WITH_EFFORTS, True),
-        "other engine": (OTHER, UNKNOWNS, False),
-        "other engine, efforts": (OTHER, WITH_EFFORTS, True),
-    }
-    ours = config_of("reacher", seed, ENGINE).env
+    """Draw robots from ``randomization=strong``, and find them: in the engine that they live in, and in another."""
     found: dict[str, list[Found]] = {}
-    for case, (real, names, feels) in cases.items():
+    for case, (most, real, taken_for, names, feels) in CASES.items():
         config = config_of("reacher", seed, "randomization=strong", *real)
+        ours = config_of("reacher", seed, *taken_for).env
+        drawn = WITH_EFFORTS if feels else UNKNOWNS
         found[case] = []
-        for number in range(robots):
-            hidden = record(config.env, config.randomization, names, seconds, seed + number, feels)
+        for number in range(min(robots, most)):
+            hidden = record(config.env, config.randomization, drawn, seconds, seed + number, feels)
             one = identify(hidden, ours, names)
             found[case].append(one)
             print(
@@ -117,7 +127,8 @@ def measure_identify(seed: int, robots: int = ROBOTS, seconds: float = SECONDS) 
 
 def identify_table(found: dict[str, list[Found]]) -> Table:
     """Show it: medians, and in brackets the worst."""
-    columns = ("robots", "delays", "intervals", "link mass", "payload", "gain", "effort", "held out", "better", "time")
+    found_of_each = ("link mass", "payload", "gain", "effort", "rotor")
+    columns = ("robots", "delays", "intervals", "explained", *found_of_each, "held out", "better", "time")
     shown = table(f"{SECONDS:.0f} s of each hidden two-link arm: median (worst)", "", *columns)
     for case, each in found.items():
         held = np.concatenate([one.held for one in each])
@@ -126,10 +137,12 @@ def identify_table(found: dict[str, list[Found]]) -> Table:
             str(len(each)),
             f"{sum(one.fit.delay == one.hidden.delay for one in each)} of {len(each)}",
             f"{held.sum()} of {len(held)}",
+            f"{sum(one.fit.explained for one in each)} of {len(each)}",
             _spread([100 * off for one in each for off in one.off("link_mass", True)], "{:.1f} %"),
             _spread([1000 * off for one in each for off in one.off("payload", False)], "{:.0f} g"),
             _spread([100 * off for one in each for off in one.off("velocity_gain", True)], "{:.2f} %"),
             _spread([100 * off for one in each for off in one.off("effort_limit", True)], "{:.1f} %"),
+            _spread([100 * off for one in each for off in one.off("armature", True)], "{:.1f} %"),
             _spread([one.noise for one in each], "{:.2f}"),
             _spread([one.better for one in each], "{:.1f}", worst=min),
             _spread([one.seconds for one in each], "{:.1f} s"),

@@ -13,7 +13,8 @@ from rich.console import Console
 from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
 from physai import cli
-from physai.config import Config, Seed, validate
+from physai.compose import cores
+from physai.config import Config, Count, Seed, validate
 from physai.envs.simulation import EnvConfig
 from physai.errors import UserError
 from physai.files import write_atomically
@@ -35,6 +36,7 @@ class IdentifyConfig(Config):
     delays: Annotated[int, Field(ge=0, le=20)]
     output: str | None
     command_topic: str
+    threads: Count | None
     seed: Seed
     env: dict[str, Any]
     physics: dict[str, Any]
@@ -47,7 +49,11 @@ class IdentifyConfig(Config):
             raise UserError("physics: only a simulated robot can be given other parameters")
         spec = RobotSpec.from_config(env.robot)
         spec.need_fixed_base("identifying")
-        return env, spec, Unknowns.of(self.fit, spec, ParameterLayout(spec))
+        unknowns = Unknowns.of(self.fit, spec, ParameterLayout(spec))
+        for name in self.fit:
+            if name in env.ignored:
+                raise UserError(f"fit: this engine cannot change '{name}': physics=mujoco can")
+        return env, spec, unknowns
 
     def trials(self, env: EnvConfig) -> Trials:
         """Read the data."""
@@ -79,6 +85,8 @@ def _identify(node: DictConfig, _: Path) -> None:
     config = validate(IdentifyConfig, node)
     env, spec, unknowns = config.robot()
     trials = config.trials(env)
+    # No result depends on the number of threads.
+    threads = {"threads": config.threads or cores()} if "threads" in env.physics else {}
     console = Console(record=True)
     for reason in trials.left_out:
         console.print(f"left out: {reason}", highlight=False, markup=False)
@@ -90,7 +98,7 @@ def _identify(node: DictConfig, _: Path) -> None:
     columns = SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn()
     with (
         Progress(*columns, transient=True, disable=not sys.stderr.isatty(), console=Console(stderr=True)) as progress,
-        closing(Predictor(spec, env.physics, env.control_dt, trials)) as predict,
+        closing(Predictor(spec, env.physics | threads, env.control_dt, trials)) as predict,
     ):
         task = progress.add_task("fitting")
         found = fit(
@@ -102,7 +110,16 @@ def _identify(node: DictConfig, _: Path) -> None:
             highlight=False,
         )
     show(console, found, spec, config.data)
+    if not found.explained and (hint := _untried(env, config.fit)):
+        console.print(f"Not tried: {hint}.", highlight=False, markup=False, soft_wrap=True)
     _write(console, config, env, spec, found, trials.period)
+
+
+def _untried(env: EnvConfig, names: list[str]) -> str:
+    """What may explain more."""
+    if env.physics.get("motor") != "servo":
+        return "the motors of a drive (physics=mujoco physics.motor=servo)"
+    return "" if "armature" in names else "the inertia of its rotors (armature among the parameters of fit=[...])"
 
 
 def _write(
@@ -115,9 +132,14 @@ def _write(
     folder.mkdir(parents=True, exist_ok=True)
     figures = {"data": config.data, "env": env.name, "physics": env.physics, "seed": config.seed}
     write_atomically(folder / "identified.json", json.dumps(figures | summary(found, spec), indent=2).encode())
+    motors = ""
+    if env.physics.get("motor") == "servo":
+        motors = f" physics=mujoco physics.motor=servo physics.motor_time_constant={env.physics['motor_time_constant']}"
+    if spec.armature.any() and "armature" not in config.fit:
+        motors += f" env.robot.armature=[{','.join(map(str, env.robot.armature))}]"
     about = (
         f"'{spec.name}' as {config.data} shows it, found by physai.identify; train with it:",
-        f"python -m physai.train env={env.name} randomization={folder / 'identified.yaml'}",
+        f"python -m physai.train env={env.name}{motors} randomization={folder / 'identified.yaml'}",
     )
     draws = identified(found, layout, config.randomization)
     write_atomically(folder / "identified.yaml", text(draws, layout, about).encode())

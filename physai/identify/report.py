@@ -17,6 +17,7 @@ _SHOWS_IN = {  # what to record for a parameter that shows in no motion
     "joint_damping": _FULL_EFFORT,
     "joint_friction": _FULL_EFFORT,
     "effort_limit": _FULL_EFFORT,
+    "armature": _FULL_EFFORT,
     "velocity_gain": "steps that are small enough for the motor to follow",
     "encoder_offset": "fast motions in poses in which gravity pulls at the joint",
 }

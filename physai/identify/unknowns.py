@@ -16,12 +16,14 @@ FITTED = (
     "joint_damping",
     "joint_friction",
     "effort_limit",
+    "armature",
     "velocity_gain",
     "encoder_offset",
 )
 _IN_PARTS = ("link_mass", "joint_damping", "effort_limit")  # found as a factor of the description; one unit is e
 _PAYLOAD, _OFFSET, _GAIN = 0.3, 0.02, 0.3  # kg, rad, 1: one unit of theirs
 _FRICTION = 0.05  # of the effort limit: one unit of friction
+_ARMATURE = 0.01  # kg·m² for each N·m of the effort limit: one unit of a rotor's inertia
 _FARTHEST = 4.0  # units
 
 
@@ -59,6 +61,7 @@ class Unknowns:
         units = {
             "payload": np.array([_PAYLOAD]),
             "joint_friction": _FRICTION * spec.effort_limit,
+            "armature": _ARMATURE * spec.effort_limit,
             "velocity_gain": np.full(len(spec.joints), _GAIN),
             "encoder_offset": np.full(len(spec.joints), _OFFSET),
         }
@@ -83,6 +86,7 @@ class Unknowns:
         for name, least, most in (
             ("payload", 0.0, np.inf),
             ("joint_friction", 0.0, np.inf),
+            ("armature", 0.0, np.inf),
             ("velocity_gain", 0.05, 1.0),
         ):
             rows = np.array(each) == name

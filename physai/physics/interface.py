@@ -11,9 +11,10 @@ AT_REST = 1e-9  # rad²/s², of missing velocity times velocity: what rounding l
 
 DynamicsParameters = dict[str, np.ndarray]
 """Per robot and absolute, each [rows, k]: ``link_mass`` (kg, one a moving link), ``payload`` (kg at the tip, 1), and
-one a joint of ``joint_damping`` (N·m·s/rad), ``joint_friction`` (N·m), ``effort_limit`` (N·m), ``velocity_gain`` (in
-(0, 1]: the share of the missing velocity that a motor makes up for in one control period of one step; at any number of
-substeps, a gain g is a motor with the time constant (1 - g) / g, in control periods).
+one a joint of ``joint_damping`` (N·m·s/rad), ``joint_friction`` (N·m), ``effort_limit`` (N·m), ``armature`` (of the
+rotor, as the joint feels it through the gears, kg·m²), and ``velocity_gain`` (in (0, 1]: the share of the missing
+velocity that a motor makes up for in one control period of one step; at any number of substeps, a gain g is a motor
+with the time constant (1 - g) / g, in control periods).
 
 Joints that are springs have, in the place of that gain, ``stiffness`` (N·m/rad) and ``servo_damping`` (N·m·s/rad). A
 robot whose base floats has ``floor_friction`` (a coefficient, 1), ``contact_time`` (of contacts with the floor: the
@@ -29,6 +30,7 @@ def nominal_dynamics(spec: RobotSpec) -> DynamicsParameters:
         "joint_damping": spec.damping[None],
         "joint_friction": spec.friction[None],
         "effort_limit": spec.effort_limit[None],
+        "armature": spec.armature[None],
     }
     if spec.servo is None:
         nominal["velocity_gain"] = np.ones((1, len(spec.joints)))

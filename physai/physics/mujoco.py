@@ -5,7 +5,7 @@ from typing import Literal
 
 import numpy as np
 
-from physai.config import Count, NonNegativeFloat, PositiveFloat
+from physai.config import Count, PositiveFloat
 from physai.errors import UserError
 from physai.physics.impulse import FASTEST, limit_velocity, motor_velocity
 from physai.physics.interface import (
@@ -54,7 +54,6 @@ class MuJoCoPhysics:
         substeps: Physics steps per control period, at least.
         motor: Which motor.
         motor_time_constant: Of a servo with a velocity gain of 1, s.
-        armature: Inertia of a servo's rotor, as the joint feels it through the gears, kg·m².
         threads: Among which the robots are divided; no result depends on it.
 
     Raises:
@@ -72,14 +71,13 @@ class MuJoCoPhysics:
         *,
         motor: Literal["impulse", "servo"],
         motor_time_constant: PositiveFloat,
-        armature: NonNegativeFloat,
         threads: Count,
     ) -> None:
         self.num_robots = num_robots
         self._spec = spec
         if motor == "servo" and spec.servo is None:
             substeps = max(substeps, math.ceil(_STEPS_PER_TIME_CONSTANT * control_dt / motor_time_constant))
-        model = _make_model(spec, motor, armature, control_dt / substeps)
+        model = _make_model(spec, motor, control_dt / substeps)
         self._batch = Batch(model, num_robots, threads)
         joints = len(spec.joints)  # a base that floats comes before them
         self._position, self._velocity = self._batch.bind("qpos")[:, -joints:], self._batch.bind("qvel")[:, -joints:]
@@ -90,7 +88,7 @@ class MuJoCoPhysics:
         self._moving = [model.body(name).id for name in spec.moving_links]
         self._unit_inertia = model.body_inertia[self._links] / np.where(mass > 0, mass, 1.0)[self._links, None]
         self._mass, self._inertia = self._batch.expand("body_mass"), self._batch.expand("body_inertia")
-        self._damping = self._batch.expand("dof_damping")
+        self._damping, self._armature = self._batch.expand("dof_damping"), self._batch.expand("dof_armature")
         self._motor: _Impulse | _Servo | _Springs
         if spec.servo is not None:
             self._motor = _Springs(self._batch, substeps, joints)
@@ -114,7 +112,9 @@ class MuJoCoPhysics:
         mass = loaded_mass(self._spec, {key: value[rows] for key, value in self._parameters.items()})
         self._mass[rows[:, None], self._links] = mass
         self._inertia[rows[:, None], self._links] = mass[:, :, None] * self._unit_inertia
-        self._damping[rows, -len(self._spec.joints) :] = self._parameters["joint_damping"][rows]
+        joints = slice(-len(self._spec.joints), None)
+        self._damping[rows, joints] = self._parameters["joint_damping"][rows]
+        self._armature[rows, joints] = self._parameters["armature"][rows]
         if self._base is not None:
             self._base.set(rows, {key: value[rows] for key, value in self._parameters.items()})
         self._batch.set_const(np.unique(rows))  # what MuJoCo derives from masses
@@ -141,7 +141,9 @@ class MuJoCoPhysics:
     def parameters(self) -> DynamicsParameters:
         """What the bodies are like as MuJoCo holds it; the rest as the motors got it."""
         parameters = {key: value.copy() for key, value in self._parameters.items()}
-        parameters["joint_damping"] = self._damping[:, -len(self._spec.joints) :].copy()
+        joints = slice(-len(self._spec.joints), None)
+        parameters["joint_damping"] = self._damping[:, joints].copy()
+        parameters["armature"] = self._armature[:, joints].copy()
         mass = self._mass.copy()
         mass[:, self._tip] -= parameters["payload"][:, 0]
         parameters["link_mass"] = mass[:, self._moving]
@@ -257,7 +259,7 @@ class _Springs:
         self.effort = self._given.copy()
 
 
-def _make_model(spec: RobotSpec, motor: str, armature: float, time_step: float) -> "mujoco.MjModel":
+def _make_model(spec: RobotSpec, motor: str, time_step: float) -> "mujoco.MjModel":
     try:
         spheres = spec.floating.spheres if spec.floating else ()
         shapes = [(sphere.body, sphere.center, sphere.radius) for sphere in spheres]
@@ -265,8 +267,6 @@ def _make_model(spec: RobotSpec, motor: str, armature: float, time_step: float) 
         made.compiler.fusestatic = False  # a link keeps its mass to itself
         for joint in made.joints:
             joint.actfrclimited = False  # the effort limit is the motor's, each robot's own
-            if motor == "servo" and spec.servo is None:
-                joint.armature = armature
             if motor == "servo" or spec.servo is not None:
                 actuator = made.add_actuator(name=joint.name, target=joint.name)
                 actuator.trntype, actuator.biastype = mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtBias.mjBIAS_AFFINE

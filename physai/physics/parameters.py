@@ -9,12 +9,13 @@ from torch import Tensor
 from physai.physics.interface import DynamicsParameters, nominal_dynamics
 from physai.robots import RobotSpec
 
-# By how much robots differ in what their description says is zero: kg, Nms/rad, Nm, m, control steps, rad, rad,
+# By how much robots differ in what their description says is zero: kg, Nms/rad, Nm, kg m², m, control steps, rad, rad,
 # rad/s, rad/s, a share of 9.81 m/s², m/s.
 _USUAL = {
     "payload": 0.5,
     "joint_damping": 0.1,
     "joint_friction": 0.1,
+    "armature": 0.01,
     "center_of_mass": 0.02,
     "actuator_delay": 1.0,
     "encoder_offset": 0.01,

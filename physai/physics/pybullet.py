@@ -61,13 +61,15 @@ class PyBulletPhysics:
         substeps: Physics steps per control period; joints that are springs get as many as their damping needs.
 
     Raises:
-        UserError: If PyBullet refuses the URDF, or has no room for so many worlds.
+        UserError: If PyBullet refuses the URDF, has no room for so many worlds, or has not what the robot has: rotors.
     """
 
     simulated = True
-    ignores = "contact_time", "center_of_mass"
+    ignores = "armature", "contact_time", "center_of_mass"
 
     def __init__(self, spec: RobotSpec, num_robots: int, control_dt: float, substeps: int = 1) -> None:
+        if spec.armature.any():
+            raise UserError(f"robot '{spec.name}': PyBullet has no rotors (armature: 0, or physics=mujoco)")
         self.num_robots = num_robots
         self.substeps = substeps
         self._spec = spec

@@ -99,6 +99,7 @@ class RandomizationConfig(Config):
     joint_damping: Draw | None
     joint_friction: Draw | None
     effort_limit: Draw | None
+    armature: Draw | None
     velocity_gain: Draw | None
     stiffness: Draw | None
     servo_damping: Draw | None

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 
 _UNITS = {
     "payload": "kg",
+    "armature": "kg m²",
     "actuator_delay": "control steps",
     "encoder_offset": "rad",
     "position_noise": "rad",

@@ -71,4 +71,4 @@ def _drives(spec: RobotSpec) -> dict[str, np.ndarray]:
     """What the joints of a pair must have alike, [n] each."""
     assert spec.servo is not None
     servo = {"stiffness": spec.servo.stiffness, "damping": spec.servo.damping}
-    return {"command_limit": spec.command_limit, "effort limit": spec.effort_limit, **servo}
+    return {"command_limit": spec.command_limit, "effort limit": spec.effort_limit, "armature": spec.armature, **servo}

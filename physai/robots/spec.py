@@ -33,10 +33,11 @@ class RobotConfig(Config):
     ``command`` says what drives the joints, and ``command_limit`` what an action of 1 means to each: with ``action:
     speed`` how fast it moves, rad/s, with ``action: offset`` how far from home it goes, rad. Joints that take positions
     either close in on them at ``position_gain``, 1/s, or are the springs of ``servo``. What follows stands in the place
-    of what the URDF says, or does not say: ``limits``, ``damping``, N·m·s/rad, and ``friction``, N·m, of joints, and
-    ``inertials`` of links by name. One number may stand for all joints. ``gravity`` is in the base's frame, m/s²: it
-    says how the base is mounted. Without ``collision`` nobody asks whether the robot touches itself. ``floating`` is of
-    a base that nothing holds; a robot that has none needs an ``end_effector``.
+    of what the URDF says, or does not say: ``limits``, ``damping``, N·m·s/rad, ``friction``, N·m, and ``armature``,
+    kg·m², of joints (what rotors add to the inertia that they feel), and ``inertials`` of links by name. One number may
+    stand for all joints. ``gravity`` is in the base's frame, m/s²: it says how the base is mounted. Without
+    ``collision`` nobody asks whether the robot touches itself. ``floating`` is of a base that nothing holds; a robot
+    that has none needs an ``end_effector``.
     """
 
     name: str
@@ -53,6 +54,7 @@ class RobotConfig(Config):
     limits: LimitsConfig | None
     damping: EachNonNegative | None
     friction: EachNonNegative | None
+    armature: EachNonNegative
     gravity: list[float] = Field(min_length=3, max_length=3)
     inertials: dict[str, InertialConfig]
     collision: CollisionConfig | None
@@ -80,6 +82,7 @@ class RobotSpec:
         floating: What there is to know of a base that nothing holds; None of one that is fixed.
         damping: N·m·s/rad, [n].
         friction: Coulomb friction, N·m, [n].
+        armature: Inertia of the rotors, as their joints feel it through the gears, kg·m², [n].
         gravity: In the base's frame, m/s², [3].
         linkage: Joints from the base to the end effector, in order; all joints of a robot that has none.
         bodies: What engines simulate, from the base on.
@@ -106,6 +109,7 @@ class RobotSpec:
     floating: FloatingBase | None
     damping: np.ndarray
     friction: np.ndarray
+    armature: np.ndarray
     gravity: np.ndarray
     linkage: tuple[Joint, ...]
     bodies: tuple[Body, ...]
@@ -204,7 +208,7 @@ class RobotSpec:
             _check_driven(path, joint)
         if len(config.home) != len(joints):
             raise UserError(f"robot '{config.name}': home has {len(config.home)} values for {len(joints)} joints")
-        told = {key: getattr(config, key) for key in ("command_limit", "damping", "friction")}
+        told = {key: getattr(config, key) for key in ("command_limit", "damping", "friction", "armature")}
         per_joint = {
             key: of_each(values, len(joints), f"robot '{config.name}': {key}")
             for key, values in told.items()
@@ -259,6 +263,7 @@ class RobotSpec:
             floating=floating,
             damping=per_joint.get("damping", _dynamics(joints, "damping")),
             friction=per_joint.get("friction", _dynamics(joints, "friction")),
+            armature=per_joint["armature"],
             gravity=np.array(config.gravity, dtype=np.float64),
             linkage=tuple(chain if tip else robot.joints),
             bodies=together,

@@ -25,7 +25,7 @@ def _ordered(ends: list[float]) -> list[float]:
 class AxisConfig(Config):
     """How an axis acts, and from where to where it goes."""
 
-    operation: Literal["scale", "set"]
+    operation: Literal["scale", "add", "set"]
     range: Annotated[list[float], Field(min_length=2, max_length=2), AfterValidator(_ordered)]
 
 
@@ -35,13 +35,13 @@ class Axis:
 
     Attributes:
         name: Of the parameter.
-        operation: ``scale`` multiplies what the robot's description says, ``set`` replaces it.
+        operation: ``scale`` multiplies what the robot's description says, ``add`` is added to it, ``set`` replaces it.
         low: Lowest value.
         high: Highest value.
     """
 
     name: str
-    operation: Literal["scale", "set"]
+    operation: Literal["scale", "add", "set"]
     low: float
     high: float
 

@@ -92,7 +92,7 @@ def evaluation(rate, episodes=1000):
     ],
 )
 def test_a_low_rate_or_a_drop_is_refused(own, other, said):
-    opinion = transfer.Opinion({"_target_": "x.Physics"}, evaluation(other), [], 1000, "default")
+    opinion = transfer.Opinion({"_target_": "x.Physics"}, 0.0, evaluation(other), [], 1000, "default")
     if said is None:
         opinion.require(evaluation(own))
     else:
@@ -105,6 +105,7 @@ def test_files_and_summary_say_how_the_policy_drives_in_the_other_engine(exporte
     said = read_metadata(exported_run / "policy.pt").raw["evaluation"]["transfer"]
     assert said["physics"]["_target_"] == "physai.physics.mujoco.MuJoCoPhysics"
     assert said["physics"]["motor"] == "servo"
+    assert said["armature"] == 0.01
     assert said["episodes"] == 100
     assert said["differences"] == []
     for name in ("success", "settled"):

@@ -70,7 +70,7 @@ def policies(panda, tmp_path_factory):
 def drive(policy, panda, config, ticks, seed=0, goals=None):
     """Drive from goal to goal among all configurations; return where the arm was, [T, n], and the controller."""
     controller = Controller(policy, ControllerConfig(**FAST, **config), lambda: 0.0)
-    physics = MuJoCoPhysics(panda, 1, DT, motor="impulse", motor_time_constant=0.015, armature=0.0, threads=1)
+    physics = MuJoCoPhysics(panda, 1, DT, motor="impulse", motor_time_constant=0.015, threads=1)
     random, visited, state = np.random.default_rng(seed), [], physics.robot_state()
     for tick in range(ticks):
         goal = None

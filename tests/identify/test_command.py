@@ -54,6 +54,27 @@ def test_it_shows_and_writes_what_was_found(run, table, hidden):
     np.testing.assert_allclose(drawn[:, hidden.layout.columns["position_noise"]].mean(), NOISE[0], rtol=0.25)
 
 
+@pytest.mark.slow
+def test_what_may_explain_more_is_named_until_it_was_tried(run, env_config, tmp_path):
+    """Motors like PyBullet's do not explain a drive with heavy rotors; drives do, when the rotors are looked for."""
+    real = env_config("reacher", "physics=mujoco", "physics.motor=servo", "env.robot.armature=0.05")
+    hidden = record(real, randomization("none"), [], 8.0, 2)
+    write_table(hidden.recording, hidden.spec.joints, tmp_path / "robot.csv")
+    fast = ("data=robot.csv", "delays=0")
+    drive = (*fast, "physics=mujoco", "physics.motor=servo")
+    _, as_pybullet, _ = run("identify", *fast, "fit=[velocity_gain]")
+    assert "Not tried: the motors of a drive (physics=mujoco physics.motor=servo)." in as_pybullet
+    _, without_rotors, _ = run("identify", *drive, "fit=[velocity_gain]")
+    assert "Not tried: the inertia of its rotors" in without_rotors
+    _, explained, _ = run("identify", *drive, "fit=[velocity_gain,armature]")
+    assert "the noise of the sensors explains them" in explained
+    assert "Not tried" not in explained
+    assert (
+        "physai.train env=reacher physics=mujoco physics.motor=servo physics.motor_time_constant=0.015 randomization="
+        in (explained.replace("\n", " "))
+    )
+
+
 @pytest.mark.parametrize(
     ("arguments", "line"),
     [
@@ -64,6 +85,12 @@ def test_it_shows_and_writes_what_was_found(run, table, hidden):
             ["data=robot.csv", "fit=[link_mass,effort_limit]"],
             "fit: effort_limit does not show in robot.csv, which has no",
         ),
+        (["data=robot.csv", "threads=0"], "threads: "),
+        (
+            ["data=robot.csv", "physics=pybullet", "env.robot.armature=0.1"],
+            "robot 'planar_arm': PyBullet has no rotors",
+        ),
+        (["data=robot.csv", "physics=pybullet", "fit=[armature]"], "fit: this engine cannot change 'armature'"),
         (["data=robot.csv", "env=kuka_reacher"], "robot.csv: it has no column 'position[lbr_iiwa_joint_1]'"),
         (["data=robot.csv", "output=robot.csv"], "output: robot.csv is no folder"),
         (["data=robot.csv", "delays=-1"], "delays: "),

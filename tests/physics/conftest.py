@@ -24,7 +24,7 @@ def planar(reacher: EnvConfig) -> RobotSpec:
     return RobotSpec.from_config(reacher.robot)
 
 
-MOTOR = {"motor_time_constant": 0.015, "armature": 0.01, "threads": 1}
+MOTOR = {"motor_time_constant": 0.015, "threads": 1}
 ENGINES = {
     "pybullet": PyBulletPhysics,
     "impulse": partial(MuJoCoPhysics, motor="impulse", **MOTOR),

@@ -131,6 +131,7 @@ def test_parameters_read_back_from_the_engine_are_those_that_were_set(spec, make
     begin = start(spec, 3, random)
     wanted = wild(spec, 3, random)
     wanted["joint_damping"] = random.uniform(0.1, 2.0, wanted["joint_damping"].shape)
+    wanted["armature"] = random.uniform(0.0, 0.1, wanted["armature"].shape)
     physics.reset(rows, begin, wanted)
     run(physics, commands(spec, 5, 20, random))
     read = physics.parameters()

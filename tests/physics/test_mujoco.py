@@ -115,12 +115,12 @@ def test_a_servo_s_effort_is_limited_and_dry_friction_holds_what_is_too_weak_for
     assert abs(stuck) < 0.02  # MuJoCo's friction creeps
 
 
-def test_a_servo_with_a_heavier_rotor_speeds_its_joint_up_more_slowly(planar):
-    speeds = []
-    for armature in (0.0, 1.0):
-        physics = MuJoCoPhysics(planar, 1, DT, motor="servo", **MOTOR | {"armature": armature})
-        reset_all(physics, resting(1, [0.0, np.pi / 2]), dynamics(planar, 1, effort_limit=1.0, joint_friction=0.0))
-        speeds.append(physics.step(np.array([[0.0, 5.0]])).joint_velocity[0, 1])
+@pytest.mark.parametrize("motor", ["impulse", "servo"])
+def test_a_motor_with_a_heavier_rotor_speeds_its_joint_up_more_slowly(planar, motor):
+    physics = ENGINES[motor](planar, 2, DT)
+    parameters = dynamics(planar, 2, effort_limit=1.0, joint_friction=0.0, armature=[0.0, 1.0])
+    reset_all(physics, resting(2, [0.0, np.pi / 2]), parameters)
+    speeds = physics.step(np.array([[0.0, 5.0]] * 2)).joint_velocity[:, 1]
     assert speeds[1] == pytest.approx(1.0 * DT / 1.0, rel=0.05)  # effort · time / inertia: the arm's is small beside it
     assert speeds[0] > 10 * speeds[1]
 

@@ -47,7 +47,7 @@ def test_what_is_added_or_set_has_an_effect_on_zero(kuka, operation):
 @pytest.mark.parametrize("randomization", ["none", "default", "strong"])
 def test_all_that_is_drawn_for_the_planar_arm_has_an_effect(planar, reacher, randomization):
     layout = ParameterLayout(planar, reacher.ignored)
-    assert layout.ignored  # of robots on legs
+    assert layout.ignored
     assert config(f"randomization={randomization}").without_effect(layout) == {}
 
 

@@ -150,6 +150,7 @@ def test_any_chain_of_turned_joints_matches_pybullet(tmp_path, seed):
         damping=None,
         friction=None,
         gravity=[0.0, 0.0, -9.81],
+        armature=0.0,
         inertials={},
         collision=None,
     )

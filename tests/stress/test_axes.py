@@ -79,6 +79,7 @@ def test_what_the_engine_cannot_change_is_no_axis(env_config):
 @pytest.mark.parametrize("name", sorted(set(RandomizationConfig.model_fields) - {"name"}))
 def test_a_value_reaches_every_robot_and_leaves_the_other_draws_as_they_are(reacher, env_config, name):
     env = env_config("a1_walk", "physics=mujoco") if name in OF_LEGS else reacher
+    env = env_config("reacher", "physics=mujoco") if name == "armature" else env
     layout = ParameterLayout(RobotSpec.from_config(env.robot))
     config = randomization("default")
     drawn = Axis.make(name, settings().axes, env)
@@ -89,7 +90,7 @@ def test_a_value_reaches_every_robot_and_leaves_the_other_draws_as_they_are(reac
     columns[layout.columns[name]] = True
     assert torch.equal(first[:, ~columns], second[:, ~columns])
     nominal = layout.nominal[columns]
-    expected = nominal * value if drawn.operation == "scale" else torch.full_like(nominal, value)
+    expected = nominal * value if drawn.operation == "scale" else torch.full_like(nominal, value)  # to zeros is added
     torch.testing.assert_close(second[:, columns], expected.expand(20, -1))
 
 
