@@ -19,7 +19,7 @@ from physai.identify.unknowns import Unknowns
 from physai.physics import ParameterLayout
 from physai.robots import RobotSpec
 
-ROBOTS, DRIVES = 20, 6  # of which a fit takes ten times as long
+ROBOTS, DRIVES = 20, 6  # of which a fit takes several times as long
 SECONDS = 30.0
 DELAYS = 4
 UNKNOWNS = ["link_mass", "payload", "joint_damping", "joint_friction", "velocity_gain"]
