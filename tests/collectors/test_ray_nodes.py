@@ -100,6 +100,7 @@ class Computers:
 def _cut_power(computer: "subprocess.Popen[str]") -> None:
     started = {computer.pid, *descendants(computer.pid)}
     raylets = {process for process in started if "/raylet " in command_of(process)}
+    assert raylets
     _kill(raylets)
     time.sleep(1)  # in which what is left of Ray there tells the learner, with the last lines of the raylet's log
     _kill(started - raylets)
