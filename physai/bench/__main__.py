@@ -28,6 +28,7 @@ PARTS = {
     "arms": "time to 95 percent of a Panda's unseen goals, against PPO, and TQC with hindsight replay",
     "identify": "what is found of hidden robots by their recordings, in the same engine and in another, and how soon",
     "identified": "policies trained for a hidden robot as its recording shows it, against those for any, on the robot",
+    "evidence": "ways to train for robots that differ, and for one that is known, on robots that nobody has met",
     "growth": "time and memory of training against frames and robots",
 }
 NEEDS = {  # the extra that a part needs, and its modules
@@ -43,6 +44,7 @@ NEEDS = {  # the extra that a part needs, and its modules
     "walk": ("bench,mujoco", ["psutil", "mujoco"]),
     "identify": ("mujoco", ["mujoco"]),
     "identified": ("mujoco", ["mujoco"]),
+    "evidence": ("mujoco", ["mujoco"]),
     "growth": ("bench", ["psutil"]),
 }
 
@@ -80,6 +82,13 @@ def _options() -> argparse.Namespace:
     parser.add_argument("--arm-times", type=float, default=22.0, help=arm_times)
     figure = Path("outputs/growth.png")
     parser.add_argument("--figure", type=Path, default=figure, help=f"where --growth draws ({figure})")
+    evidence = Path("outputs/evidence")
+    parser.add_argument(
+        "--evidence-folder",
+        type=Path,
+        default=evidence,
+        help=f"of --evidence, which goes on with what lies there ({evidence})",
+    )
     options = parser.parse_args()
     options.parts = options.parts or list(PARTS)
     if options.seed < 0 or options.seeds < 1 or min(options.peer_seconds, options.arm_times) <= 0:

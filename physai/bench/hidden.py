@@ -50,6 +50,12 @@ class Hidden:
         return RandomizationConfig.model_validate({**others, **draws, "name": "hidden"})
 
 
+def draw(draws: RandomizationConfig, layout: ParameterLayout, seed: int) -> np.ndarray:
+    """Return a robot's parameters, [1, P]."""
+    drawn: np.ndarray = draws.sample(1, layout, torch.Generator().manual_seed(seed)).double().numpy()
+    return drawn
+
+
 def record(
     config: EnvConfig, draws: RandomizationConfig, kept: list[str], seconds: float, seed: int, feels: bool = False
 ) -> Hidden:
@@ -66,7 +72,7 @@ def record(
     spec = RobotSpec.from_config(config.robot)
     layout = ParameterLayout(spec)
     random = np.random.default_rng(seed)
-    drawn = draws.sample(1, layout, torch.Generator().manual_seed(seed)).double().numpy()
+    drawn = draw(draws, layout, seed)
     delay = int(drawn[0, layout.columns["actuator_delay"]][0])
     for name, columns in layout.columns.items():
         if name not in kept:
