@@ -1,8 +1,9 @@
 """Find the robot whose motions are those that were recorded."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -148,7 +149,7 @@ def fit(predict: Predictor, trials: Trials, unknowns: Unknowns, longest: int, se
 
     Errors far beyond those of most motions count less at first (Huber, 1964), and motions full of them are left out: a
     computer that was too late has spoilt them. Slopes come from one rollout in which each unknown is changed in a robot
-    of its own. Every fourth motion is held out.
+    of its own. Every fourth motion is held out; only where it began is found for it, as for the others.
 
     Args:
         predict: Of the trials.
@@ -171,12 +172,15 @@ def fit(predict: Predictor, trials: Trials, unknowns: Unknowns, longest: int, se
         found.append(problem.solve(start, delay, _FIRST))
         told(f"start {number} of {len(starts)}: {found[-1][0].cost:.4g}")
     best, at = min(found, key=_cost)
+
+    def tried(begin: np.ndarray, delay: float) -> tuple[OptimizeResult, float]:
+        solved = problem.solve(begin, delay, _FIRST)
+        told(f"delay of {delay / predict.per_control_step:g} steps: {_cost(solved):.4g}")
+        return solved
+
     for _ in range(_ROUNDS):
         problem.set_doubt(best, at)
-        found = []
-        for delay in delays:
-            found.append(problem.solve(best.x, delay, _FIRST))
-            told(f"delay of {delay / predict.per_control_step:g} steps: {found[-1][0].cost:.4g}")
+        found = _downhill(at, delays, partial(tried, best.x))
         result, at = min(found, key=_cost)
         best, at = problem.solve(result.x, at, _MORE)
         if not problem.leave_out(best, at):
@@ -190,6 +194,17 @@ def fit(predict: Predictor, trials: Trials, unknowns: Unknowns, longest: int, se
             best, at = better
             told(f"delay of {at / predict.per_control_step:g} steps: {best.cost:.4g}")
     return problem.judge(best, at)
+
+
+def _downhill(
+    start: float, delays: Collection[float], solve: Callable[[float], tuple[OptimizeResult, float]]
+) -> list[tuple[OptimizeResult, float]]:
+    """Solve with a delay, and with its neighbors until none is better: costs rise on both sides of the right one."""
+    best, found = start, {start: solve(start)}
+    while untried := [at for at in (best - 1, best + 1) if at in delays and at not in found]:
+        found |= {at: solve(at) for at in untried}
+        best = min(found, key=lambda at: _cost(found[at]))
+    return list(found.values())
 
 
 def _cost(found: tuple[OptimizeResult, float]) -> float:
@@ -298,11 +313,31 @@ class _Problem:
             options |= {"loss": "huber", "f_scale": self._doubt}
         return least_squares(self.errors, self.inside(start), self.slopes, args=(delay,), **options), delay
 
+    def _begun(self, coordinates: np.ndarray, delay: float) -> np.ndarray:
+        """Find where the motions held out began, too, with the robot as it is; two steps of Gauss and Newton.
+
+        Of them as of the others, a mean of few noisy positions says it only roughly, which counts as one unit.
+        """
+        size, joints = len(self._unknowns), self._trials.start.shape[1]
+        coordinates, changes = coordinates.copy(), np.zeros((1 + joints, len(coordinates)))
+        starts = coordinates[size:].reshape(-1, joints)  # a view
+        changes[1:, size:] = np.tile(np.eye(joints), len(starts))
+        for _ in range(2):
+            errors = self._all(coordinates + changes, delay)[:, :2]
+            for trial in np.flatnonzero(self._held_out.any(axis=(0, 1, 3))):
+                shown = self._held_out[:, :, trial]
+                now, *changed = errors[:, :, :, trial][:, shown]
+                slopes = np.stack(changed, axis=1) - now[:, None]
+                away = slopes.T @ now + starts[trial]
+                starts[trial] -= np.linalg.solve(slopes.T @ slopes + np.eye(joints), away)
+        return coordinates
+
     def judge(self, result: OptimizeResult, delay: float) -> Fit:
         """Say what is known by now."""
         size = len(self._unknowns)
         described, found = (
-            self._all(at[None], late)[0, :2] for at, late in ((np.zeros_like(result.x), 0.0), (result.x, delay))
+            self._all(self._begun(at, late)[None], late)[0, :2]
+            for at, late in ((np.zeros_like(result.x), 0.0), (result.x, delay))
         )
         ratio = float(np.sqrt(np.square(found[self._held_out]).mean()))
         squares = np.where(self._held_out, np.square(np.stack([described, found])), np.nan)[:, 0]
