@@ -145,7 +145,7 @@ class _Stopper(FleetClient):
                 if arm.state in (State.ESTOP.value, State.FAULT.value) and now - asked[name] > _AGAIN:
                     self._resets[name].call_async(Trigger.Request())
                     asked[name] = now
-                elif arm.rests and now - arm.since > _AGAIN:
+                elif self.heard[name].still[-1] and now - arm.since > _AGAIN:  # also where a joint is at its limit
                     self._send(arm)
             if not all(map(_on_its_way, self.arms.values())) or any(heard.still[-1] for heard in self.heard.values()):
                 since = now
