@@ -15,7 +15,7 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
 _HEADER = 16  # bytes before the compressed part of a frame; the last eight are its length
-_SAME = 1e-6  # rad: who sees the page cannot tell such angles apart
+_SAME = 1e-4  # rad: viser does not even send such changes
 _CAMERA = _messages.ViewerCameraMessage(
     (1.0, 0.0, 0.0, 0.0), (1.0, 1.0, 1.0), 1.0, 0.1, 10.0, 100, 100, (0.0, 0.0, 0.0), (0.0, 0.0, 1.0)
 )
