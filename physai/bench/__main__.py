@@ -16,7 +16,7 @@ from physai.errors import UserError
 PARTS = {
     "policy": "one command of an exported policy, in every form that it has",
     "ros": "period and answers of the ROS 2 node, beside a bare one's",
-    "fleet": "eight virtual arms: how soon one message stops all of them, and how regularly they are driven",
+    "fleet": "eight virtual arms and the page: how regularly they are driven, and how soon one message stops all",
     "gym": "the Gymnasium envs, against one written by hand and Stable-Baselines3's vector env",
     "startup": "how soon commands answer, how soon the first frame is there, and how long a thousand episodes take",
     "collection": "collection by one process and by two, against a bare PyBullet loop; and by each collector",
@@ -34,7 +34,7 @@ PARTS = {
 NEEDS = {  # the extra that a part needs, and its modules
     "policy": ("onnx", onnx.PACKAGES),
     "ros": ("ros", ["rclpy"]),
-    "fleet": ("ros", ["rclpy"]),
+    "fleet": ("ros,web", ["rclpy", "viser"]),
     "gym": ("bench", ["stable_baselines3"]),
     "training": ("bench,mujoco", ["stable_baselines3", "mujoco"]),
     "algorithms": ("bench", ["stable_baselines3"]),

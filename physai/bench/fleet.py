@@ -1,9 +1,14 @@
-"""Eight virtual arms on this computer: how soon one message stops all of them, and how regularly they are driven."""
+"""Eight virtual arms on this computer, and the page that shows them.
+
+How regularly they are driven with the page and without, how old is what it shows, and how soon one message stops all.
+"""
 
 import os
+import re
 import tempfile
 import time
 from argparse import Namespace
+from collections import defaultdict
 from contextlib import closing
 from dataclasses import dataclass, field
 from functools import partial
@@ -12,25 +17,34 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from rclpy.subscription import Subscription
 from rich.table import Table
+from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool, Float64MultiArray
 from std_srvs.srv import Trigger
 
 from physai.artifact import FILES
+from physai.bench.onlooker import Onlooker, ages
 from physai.bench.policy import make_run
-from physai.bench.timing import table
+from physai.bench.timing import cpu_seconds, table
 from physai.deploy import Metadata, State, read_metadata
 from physai.errors import UserError
 from physai.ros.driving.fleet_client import Arm, FleetClient
 from physai.ros.driving.fleet_nodes import fleet_nodes
+from physai.ros.driving.forked import ForkedNode
+from physai.ros.driving.processes import NodeProcess
+from physai.ros.topics import joint_states, qos
 from physai.ros.topics.commands import controller_topic
 from physai.ros.topics.emergency_stop import ALL
+from physai.ros.topics.unawaited import Unawaited, nobody, waiting
 
 ARMS = 8
 TRIALS = 100
 DRIVE_SECONDS = 20.0
 MOVING = 0.3  # s that all arms move before they are stopped
 LIMIT = 0.05  # s
+_PAGE = "physai.ros.dashboard"
+_GRID, _SETTLED = 10_000_000, 1_000_000_000  # ns between two looks at the page, and before the first
 _PATIENCE, _AFTER, _AGAIN = 60.0, 0.3, 0.5  # s
 
 
@@ -40,11 +54,16 @@ class FleetFigures:
 
     Attributes:
         zeros: From the message to the first zeros at each robot, s, [trials, arms].
-        periods: Between the commands of the inference nodes, by their own clock, s.
+        periods: Between the commands of the inference nodes, by their own clock, s: while nobody listens, and beside
+            the dashboard, which somebody looks at.
+        ages: Of the joint states that the page shows, from when the robot sent them, every 10 ms, s.
+        cpu: Share of a core, of the nodes of each kind together.
     """
 
     zeros: np.ndarray
-    periods: np.ndarray
+    periods: tuple[np.ndarray, np.ndarray]
+    ages: np.ndarray
+    cpu: dict[str, float]
 
 
 @dataclass
@@ -69,15 +88,30 @@ class _Stopper(FleetClient):
     def __init__(self, fleet: dict[str, Metadata], seed: int) -> None:
         super().__init__(fleet, seed, lambda name, arm: None)
         node = self._node
-        self._stop = node.create_publisher(Bool, ALL, 10)
+        self._stop = node.create_publisher(Bool, ALL, 10, event_callbacks=qos.SILENT_PUBLISHER)
         self._resets = {name: node.create_client(Trigger, f"{name}/inference_node/reset") for name in fleet}
         self.heard = {name: _Heard() for name in fleet}
+        self._told: dict[str, Subscription] = {}
         for name, metadata in fleet.items():
             topic = f"{name}/{controller_topic(metadata.command.quantity)}"
             take: Any = self.heard[name].take
             node.create_subscription(Float64MultiArray, topic, take, 1000)
             take = self.heard[name].take_source
             node.create_subscription(Float64MultiArray, f"{name}/command_watchdog/commands", take, 1000)
+
+    def listen(self) -> None:
+        """Have the joint states kept from now on; nobody is woken by them."""
+        for name in self.arms:
+            self._told[name] = self._node.create_subscription(
+                JointState, f"{name}/{joint_states.TOPIC}", nobody, 100_000, callback_group=Unawaited()
+            )
+
+    def told(self) -> dict[str, np.ndarray]:
+        """Return when each arm sent where its first joint is, ns since 1970 and rad, [n, 2]."""
+        return {
+            name: np.array([(info["source_timestamp"], message.position[0]) for message, info in waiting(told)])
+            for name, told in self._told.items()
+        }
 
     def stop(self) -> np.ndarray:
         """Stop all, and return when zeros came to each robot, s later; NaN where none did."""
@@ -111,13 +145,20 @@ class _Stopper(FleetClient):
                 if arm.state in (State.ESTOP.value, State.FAULT.value) and now - asked[name] > _AGAIN:
                     self._resets[name].call_async(Trigger.Request())
                     asked[name] = now
-                elif arm.state in (State.WAITING.value, State.REACHED.value) and now - arm.since > 0.1:
+                elif self.heard[name].still[-1] and now - arm.since > _AGAIN:  # also where a joint is at its limit
                     self._send(arm)
             if not all(map(_on_its_way, self.arms.values())) or any(heard.still[-1] for heard in self.heard.values()):
                 since = now
             return now - since > MOVING
 
         self._wait(moving, "arms that move")
+
+    def periods(self, nodes: list[ForkedNode]) -> np.ndarray:
+        """Drive for a while, and return what passed between two commands of each inference node, s."""
+        self.drive(nodes, 0.5, 2.0)
+        self.forget()
+        self.drive(nodes, 0.5, DRIVE_SECONDS)
+        return np.concatenate([np.diff(heard.sent) for heard in self.heard.values()]) * 1e-9
 
     def _wait(self, done: Any, what: str) -> None:
         if not self._spin(done, _PATIENCE):
@@ -159,18 +200,47 @@ def measure_fleet(seed: int) -> FleetFigures:
             closing(_Stopper(dict.fromkeys(fleet, metadata), seed)) as client,
         ):
             client.wait_until_ready(nodes)
-            print(f"Driving {ARMS} arms for {DRIVE_SECONDS:g} s ...", flush=True)
-            client.drive(nodes, 0.5, 2.0)
-            client.forget()
-            client.drive(nodes, 0.5, DRIVE_SECONDS)
-            periods = np.concatenate([np.diff(heard.sent) for heard in client.heard.values()]) * 1e-9
-            print(f"Stopping all of them {TRIALS} times ...", flush=True)
-            zeros = []
-            for _ in range(TRIALS):
-                client.start()
-                client.forget()
-                zeros.append(client.stop())
-    return FleetFigures(np.array(zeros), periods)
+            print(f"Driving {ARMS} arms for {DRIVE_SECONDS:g} s, twice ...", flush=True)
+            alone = client.periods(nodes)
+            with NodeProcess(_PAGE, Path(folder) / "page", port=0) as page:
+                host, port = _address(client, page, nodes)
+                with closing(Onlooker(host, port)) as onlooker:
+                    client.listen()
+                    before, since = _cpu_seconds(nodes, page), time.monotonic()
+                    watched = client.periods(nodes)
+                    elapsed, after = time.monotonic() - since, _cpu_seconds(nodes, page)
+                    told = client.told()
+                    old = [_ages(onlooker.shown(name[1:]), told[name]) for name in fleet]
+                print(f"Stopping all of them {TRIALS} times ...", flush=True)
+                zeros = []
+                for _ in range(TRIALS):
+                    client.start()
+                    client.forget()
+                    zeros.append(client.stop())
+    cpu = {kind: (after[kind] - seconds) / elapsed for kind, seconds in before.items()}
+    return FleetFigures(np.array(zeros), (alone, watched), np.concatenate(old), cpu)
+
+
+def _address(client: _Stopper, page: NodeProcess, nodes: list[ForkedNode]) -> tuple[str, int]:
+    until = time.monotonic() + 2 * _PATIENCE  # it gives way to all others
+    while not (found := re.search(r"http://([^\s:]+):([0-9]+)", page.log.read_text())):
+        if page.ended or time.monotonic() > until:
+            raise UserError(f"no dashboard: {page.last_words()}")
+        client.drive(nodes, 0.5, 0.5)
+    return found[1], int(found[2])
+
+
+def _ages(shown: np.ndarray, told: np.ndarray) -> np.ndarray:
+    return ages(shown, told, range(int(told[0, 0]) + _SETTLED, int(told[-1, 0]), _GRID))
+
+
+def _cpu_seconds(nodes: list[ForkedNode], page: NodeProcess) -> dict[str, float]:
+    """By kind of node."""
+    seconds: defaultdict[str, float] = defaultdict(float)
+    processes = [(node.module, node.pid) for node in nodes] + [(page.module, page.pid)]
+    for module, pid in processes:
+        seconds[module.rpartition(".")[2]] += cpu_seconds(pid)
+    return dict(seconds)
 
 
 def fleet_table(figures: FleetFigures) -> Table:
@@ -183,7 +253,10 @@ def fleet_table(figures: FleetFigures) -> Table:
     for name, values in (
         (f"{ALL} to zeros at a robot", figures.zeros),
         (f"{ALL} to zeros at the last robot", last),
-        ("period of the commands", figures.periods),
+        ("period of the commands", figures.periods[0]),
+        ("the same, with the dashboard", figures.periods[1]),
+        ("age of joint states on its page", figures.ages),
     ):
         shown.add_row(name, *(f"{1e3 * value:.2f}" for value in (*np.quantile(values, [0.5, 0.99]), values.max())))
+    shown.caption = "share of a core: " + ", ".join(f"{kind} {share:.0%}" for kind, share in figures.cpu.items())
     return shown

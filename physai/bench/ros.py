@@ -17,7 +17,7 @@ from std_msgs.msg import Float64MultiArray, String
 
 from physai.artifact import FILES
 from physai.bench.policy import make_run
-from physai.bench.timing import table
+from physai.bench.timing import cpu_seconds, table
 from physai.deploy import read_metadata
 from physai.errors import UserError
 from physai.ros.driving.processes import NodeProcess
@@ -124,7 +124,7 @@ def _periods(listener: _Listener, policy: Path, logs: Path) -> tuple[dict[str, n
         for node in [*nodes.values(), NodeProcess("physai.ros.virtual_robot", logs / "robot")]:
             stack.enter_context(node)
         _wait(listener, lambda: all(len(messages) > 100 for messages in heard.values()), nodes)
-        before = {name: (len(heard[name]), _cpu_seconds(node.pid)) for name, node in nodes.items()}
+        before = {name: (len(heard[name]), cpu_seconds(node.pid)) for name, node in nodes.items()}
         started = time.monotonic()
         listener.spin(lambda: False, PERIOD_SECONDS)
         elapsed = time.monotonic() - started
@@ -132,7 +132,7 @@ def _periods(listener: _Listener, policy: Path, logs: Path) -> tuple[dict[str, n
         for name, node in nodes.items():
             first, seconds = before[name]
             periods[name] = np.diff([sent for _, sent in heard[name][first:]]) * 1e-9
-            cpu[name] = (_cpu_seconds(node.pid) - seconds) / elapsed
+            cpu[name] = (cpu_seconds(node.pid) - seconds) / elapsed
     return periods, cpu
 
 
@@ -192,11 +192,6 @@ def _starts(listener: _Listener, policy: Path, logs: Path) -> dict[str, np.ndarr
 def _wait(listener: _Listener, ready: Callable[[], object], nodes: dict[str, NodeProcess]) -> None:
     if not listener.spin(lambda: ready() or any(node.ended for node in nodes.values()), _PATIENCE) or not ready():
         raise UserError("; ".join(f"{name}: {node.last_words()}" for name, node in nodes.items()))
-
-
-def _cpu_seconds(pid: int) -> float:
-    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")  # user and system time
 
 
 def ros_table(figures: dict[str, RosFigures]) -> Table:

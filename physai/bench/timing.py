@@ -61,3 +61,9 @@ def table(title: str, *columns: str) -> Table:
     for column in columns:
         made.add_column(column, justify="right")
     return made
+
+
+def cpu_seconds(pid: int) -> float:
+    """Return the time that a process has computed, by itself and in the kernel."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")

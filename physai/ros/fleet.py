@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 _FOREVER = 1e9  # s
 _PATIENCE = 60.0  # s, for the dashboard to start
-_PER_CORE = 1.5  # arms, with their nodes
+_PER_CORE = 4  # arms of two joints, with their nodes
 _MOST = 9  # arms: more processes than that do not find each other on one computer's loopback
 
 
@@ -103,7 +103,7 @@ def _fleet(node: DictConfig, _: Path) -> None:
         for namespace, (path, metadata) in fleet.items():
             console.print(f"{namespace}: {path} drives a virtual {metadata.robot}")
         cores = os.cpu_count() or 1
-        if config.arms > (enough := max(1, int(_PER_CORE * cores))):
+        if config.arms > (enough := _PER_CORE * cores):
             console.print(
                 f"{config.arms} arms are many for {cores} cores, and one that is late stops: try arms={enough}"
             )

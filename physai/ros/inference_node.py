@@ -75,7 +75,8 @@ class InferenceNode(StoppableNode[InferenceConfig]):
         policy = self.load()
         self._controller = make_controller(policy, config)
         self._goal = self.first_goal(policy)
-        self._robot = JointStates(self, policy.metadata.joints, self._on_joint_states)
+        answers = config.trigger == "joint_state"  # else they wait for the tick, and need not wake this node
+        self._robot = JointStates(self, policy.metadata.joints, self._on_joint_states if answers else None)
         self._imu = ImuTopic(self) if policy.metadata.floats else None
         self._command = Command(None, State.WAITING, ())
         self._stop_file = EmergencyStopFile(self.get_fully_qualified_name(), self.context.get_domain_id())
@@ -147,10 +148,9 @@ class InferenceNode(StoppableNode[InferenceConfig]):
     # What comes in
 
     def _on_joint_states(self) -> None:
-        if self.config.trigger == "joint_state":
-            self._answered = time.monotonic()
-            self._timing.tick(self._answered)
-            self._tick()
+        self._answered = time.monotonic()
+        self._timing.tick(self._answered)
+        self._tick()
 
     def _take_goal(self, message: Any) -> None:
         self._goal = goals.from_message(message, self._controller.policy.metadata.goal)
@@ -206,6 +206,7 @@ class InferenceNode(StoppableNode[InferenceConfig]):
             self._tick()
 
     def _tick(self) -> None:
+        self._robot.hear()
         now = time.monotonic()
         interlocks = self._interlocks(now)
         goal, self._goal = self._goal, None

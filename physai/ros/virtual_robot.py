@@ -4,6 +4,7 @@ import sys
 import time
 from dataclasses import dataclass
 
+from rclpy.qos import QoSProfile
 from rclpy.time import Time
 from sensor_msgs.msg import JointState as JointStateMessage
 from std_msgs.msg import Float64MultiArray
@@ -14,6 +15,7 @@ from physai.errors import UserError
 from physai.ros.node.run import StoppableNode, run
 from physai.ros.topics import joint_states, qos
 from physai.ros.topics.commands import controller_topic
+from physai.ros.topics.unawaited import Unawaited, nobody, waiting
 from physai.ros.virtual.arm import GroupController, VirtualArm
 from physai.ros.virtual.base import BaseTopics
 from physai.ros.virtual.faults import FaultConfig, Faults
@@ -38,6 +40,7 @@ class VirtualRobotConfig(FaultConfig):
     command_timeout: float = parameter(0.0, "a command is over after this; 0: it holds for ever", "s", 0.0, 60.0)
 
 
+_COMMANDS = QoSProfile(depth=100)  # of all that have come since the last step each counts: one alone may be a bad one
 _LONGEST_PAUSE = 1.0  # s that the arm makes up for; in a longer one, such as a computer's sleep, it slept, too
 
 
@@ -70,7 +73,9 @@ class VirtualRobot(StoppableNode[VirtualRobotConfig]):
         floats = self._arm.spec.floating is not None
         self._base = BaseTopics(self, self._arm.spec.base) if floats else None
         commands = controller_topic(self._arm.spec.command)
-        self.create_subscription(Float64MultiArray, commands, self._take_command, qos.COMMAND)
+        self._commands = self.create_subscription(
+            Float64MultiArray, commands, nobody, _COMMANDS, callback_group=Unawaited()
+        )
         self.offer("~/reset", self._reset)
         self._period, self._at = 1.0 / config.rate_hz, time.monotonic()  # of a step, and when the last one ended
         self.every(self._period, self._step)
@@ -81,9 +86,9 @@ class VirtualRobot(StoppableNode[VirtualRobotConfig]):
         self._faults.config = config
         self._controller.timeout = config.command_timeout
 
-    def _take_command(self, message: Float64MultiArray) -> None:
+    def _take_command(self, message: Float64MultiArray, info: dict[str, int]) -> None:
         was = self._controller.active
-        self._controller.command(message.data, time.monotonic())
+        self._controller.command(message.data, qos.received_at(info))
         if was and not self._controller.active:
             self.get_logger().error(
                 f"{len(message.data)} numbers for {len(self._order)} joints: inactive until ~/reset"
@@ -95,6 +100,8 @@ class VirtualRobot(StoppableNode[VirtualRobotConfig]):
         return True, "at home"
 
     def _step(self) -> None:
+        for command in waiting(self._commands):
+            self._take_command(*command)
         now = time.monotonic()
         self._at = max(self._at, now - _LONGEST_PAUSE)
         # An arm does not slow down with the computer that plays it.

@@ -123,6 +123,15 @@ def test_a_command_of_a_wrong_length_makes_it_deaf_until_a_reset(robot):
 
 
 @pytest.mark.slow
+def test_a_bad_command_counts_although_a_good_one_follows_before_the_next_step(robot):
+    for velocity in ([0.1], [0.1, 0.2]):
+        robot.peer.publish(TOPIC, Float64MultiArray(data=array("d", velocity)), 10)
+    wait_for(lambda: "inactive until ~/reset" in robot.process.output, what="a robot that is deaf")
+    robot.settles_at(0.0, 0.0)
+    assert robot.peer.call(f"{NODE}/reset").success
+
+
+@pytest.mark.slow
 @pytest.mark.realtime
 def test_states_come_a_hundred_times_a_second_in_order(robot):
     since = time.monotonic()

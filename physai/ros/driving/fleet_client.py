@@ -45,6 +45,11 @@ class Arm:
     sent: int = 0
     reached: int = 0
 
+    @property
+    def rests(self) -> bool:
+        """Whether it waits for a goal; a hold that lasts does, too: one that is late goes on by itself at once."""
+        return self.state in (State.WAITING.value, State.REACHED.value, State.HOLD.value)
+
 
 class FleetClient:
     """A node in a context of its own that sends goals to the inference nodes of namespaces, and watches them.
@@ -89,7 +94,7 @@ class FleetClient:
             raise UserError(f"not all nodes work after {_START:g} s: {told}")
 
     def drive(self, nodes: list[ForkedNode], hold: float, seconds: float) -> None:
-        """Send each arm a goal, and another one a while after it has reached it, s.
+        """Send each arm a goal, and another one a while after it has reached it or given up, s.
 
         Raises:
             UserError: If one of the nodes has ended, or a namespace has another robot.
@@ -100,7 +105,7 @@ class FleetClient:
             self._check_alone()  # who was there before may be found late
             now = time.monotonic()
             for arm in self.arms.values():
-                if arm.state in (State.WAITING.value, State.REACHED.value) and now - arm.since > hold:
+                if arm.rests and now - arm.since > hold:
                     self._send(arm)
             return False
 

@@ -10,8 +10,10 @@ from typing import Any, Literal
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.clock import Clock, ClockType
 from rclpy.node import Node, NodeNameNonExistentError
 from rclpy.publisher import Publisher
+from rclpy.subscription import Subscription
 from sensor_msgs.msg import Imu, JointState
 from std_msgs.msg import Bool, String
 from std_srvs.srv import SetBool, Trigger
@@ -22,9 +24,11 @@ from physai.errors import UserError
 from physai.ros.live.status import Status
 from physai.ros.topics import goals, imu, joint_states, qos
 from physai.ros.topics.emergency_stop import ALL
+from physai.ros.topics.unawaited import Unawaited, nobody, waiting
 from physai.signals import Quantity
 
 _NODE = "inference_node"
+_HEAR = 0.02  # s between two looks for what sensors have told
 _MOST = 64  # robots
 _FORGET = 300.0  # s after which a robot that has gone is not shown any more
 _STALE = 0.5  # s that what people ask may wait: what comes later, nobody expects any more
@@ -77,6 +81,7 @@ class Robots:
         self._looked = time.monotonic()
         self.stopped: float | None = None
         node.create_subscription(DiagnosticArray, "/diagnostics", self._take_diagnostics, 100)
+        node.create_timer(_HEAR, self._hear, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     @property
     def all(self) -> list[Status]:
@@ -101,6 +106,10 @@ class Robots:
             link.look(now, elapsed)
             if not link.status.present and now - link.status.since > _FORGET:
                 self._links.pop(namespace).close()
+
+    def _hear(self) -> None:
+        for link in self._links.values():
+            link.hear()
 
     def _take_diagnostics(self, message: Any) -> None:
         for status in message.status:
@@ -166,15 +175,28 @@ class _Link:
         status.rate = self._count / elapsed if elapsed > 0 else 0.0
         self._count = 0
         if present and self._joints is None and (topic := self._heard("JointState", joint_states.TOPIC)):
-            self._joints = self._node.create_subscription(JointState, topic, self._take_joints, qos.SENSOR)
+            self._joints = self._unawaited(JointState, topic)
         if present and self._walks and self._imu is None and (topic := self._heard("Imu", imu.TOPIC)):
-            self._imu = self._node.create_subscription(Imu, topic, self._take_imu, qos.SENSOR)
+            self._imu = self._unawaited(Imu, topic)
         for since, client, future in self._waiting[:]:
             if now - since > _ANSWER and not future.done():
                 client.remove_pending_request(future)
                 self.say("no answer: ask again, or look there")
             if now - since > _ANSWER or future.done():
                 self._waiting.remove((since, client, future))
+
+    def _unawaited(self, kind: type, topic: str) -> Subscription:
+        """Sensors speak so often that to be woken by each of them would be most of a page's work."""
+        return self._node.create_subscription(kind, topic, nobody, qos.PARTS, callback_group=Unawaited())
+
+    def hear(self) -> None:
+        """Take what its sensors have told meanwhile."""
+        if self._joints is not None:
+            for message, info in waiting(self._joints):
+                self._take_joints(message, qos.received_at(info))
+        if self._imu is not None:
+            for message, _ in waiting(self._imu):
+                self._take_imu(message)
 
     def _heard(self, kind: str, name: str) -> str | None:
         """Where it hears a kind of sensor_msgs, which may have been remapped; None while that is not known."""
@@ -209,12 +231,12 @@ class _Link:
                 self._node.destroy_publisher(self._goals)
             self._goals = self._node.create_publisher(kind, f"{self._name}/goal", 1)
 
-    def _take_joints(self, message: JointState) -> None:
+    def _take_joints(self, message: JointState, received: float) -> None:
         self._count += 1
         if len(message.name) == len(message.position):
             told = dict(zip(message.name, message.position, strict=True))
             self.status.joint_position = {**self.status.joint_position, **told}
-            self.status.moved = time.monotonic()
+            self.status.moved = received
 
     def _take_imu(self, message: Imu) -> None:
         turn = message.orientation

@@ -4,11 +4,11 @@ from collections.abc import Sequence
 
 import rclpy
 from rclpy.context import Context
-from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
 from physai.errors import UserError
+from physai.ros.node.executor import Executor
 from physai.ros.node.run import brief, prepare_middleware
 
 
@@ -38,8 +38,7 @@ class Guest:
         except RuntimeError as error:  # RCLError
             raise UserError(brief(error)) from error
         self.node = Node(name, context=self._context, start_parameter_services=False, enable_rosout=False)
-        self.executor = SingleThreadedExecutor(context=self._context)
-        self.executor.add_node(self.node)
+        self.executor = Executor(self.node)
 
     def close(self) -> None:
         """Leave ROS."""

@@ -15,7 +15,6 @@ from typing import Generic
 import rclpy
 from rclpy.clock import Clock, ClockType
 from rclpy.exceptions import ParameterException
-from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
@@ -24,6 +23,7 @@ from std_srvs.srv import Trigger
 from physai.deploy.parameters import Parameters
 from physai.errors import UserError
 from physai.ros.node import signals
+from physai.ros.node.executor import Executor
 from physai.ros.node.outlet import outlets
 from physai.ros.node.parameters import P, declare, help_text
 
@@ -145,8 +145,7 @@ def _run(make_node: Callable[[], StoppableNode[P]], caught: Mapping[int, object]
         return 1
     gc.collect()
     gc.freeze()  # to look for garbage in all that is imported would hold up every command for a tenth of a second
-    executor = SingleThreadedExecutor()
-    executor.add_node(node)
+    executor = Executor(node)
     last_words = ""
     try:
         while not node.stopped and not caught:

@@ -9,6 +9,7 @@ from sensor_msgs.msg import JointState as JointStateMessage
 
 from physai.deploy import JointState
 from physai.ros.topics import qos
+from physai.ros.topics.unawaited import Unawaited, waiting
 
 TOPIC = "joint_states"  # in the robot's namespace
 # Numbers of lost messages are skipped, at most so many and so many a second; farther on counts somebody else.
@@ -22,14 +23,14 @@ class JointStates:
     Args:
         node: Whose remaps and clock hold.
         joints: Those that matter; messages that name none of them are not looked at.
-        heard: Called when messages have come that name some.
+        heard: Called when messages have come that name some; None where it is enough to look with ``hear``.
 
     Attributes:
-        stamp_age: Age of the last message by its stamp, s; of use where the robot's clock agrees with ours.
+        stamp_age: Age of the last message by its stamp as it came, s; of use where the robot's clock agrees with ours.
         others: How many messages named none of the joints.
     """
 
-    def __init__(self, node: Node, joints: Sequence[str], heard: Callable[[], None]) -> None:
+    def __init__(self, node: Node, joints: Sequence[str], heard: Callable[[], None] | None) -> None:
         self._node, self._joints, self._heard = node, frozenset(joints), heard
         self.stamp_age: float | None = None
         self.others = 0
@@ -40,18 +41,18 @@ class JointStates:
             TOPIC,
             self._take,  # type: ignore[arg-type]  # rclpy also takes callbacks with two arguments
             qos.PARTS,
+            callback_group=Unawaited() if heard is None else None,
         )
+
+    def hear(self) -> bool:
+        """Take what has come meanwhile, of which the newest of each part counts; return whether it names a joint."""
+        ours = [self._keep(*taken) for taken in waiting(self._subscription)]
+        return any(ours)
 
     def _take(self, message: JointStateMessage, info: dict[str, int]) -> None:
         ours = self._keep(message, info)
         # Whatever has come meanwhile, too: where messages have queued up, only the newest shall count.
-        waiting, kind = self._subscription.handle, self._subscription.msg_type
-        with waiting:
-            for _ in range(qos.PARTS.depth):  # a flood must not keep the tick waiting for its end
-                if not (taken := waiting.take_message(kind, False)):
-                    break
-                ours |= self._keep(*taken)
-        if ours:
+        if (self.hear() or ours) and self._heard is not None:
             self._heard()
 
     def _keep(self, message: JointStateMessage, info: dict[str, int]) -> bool:
@@ -61,16 +62,18 @@ class JointStates:
             self.others += 1
             return False
         stamp = message.header.stamp.sec + message.header.stamp.nanosec * 1e-9
-        self.stamp_age = self._node.get_clock().now().nanoseconds * 1e-9 - stamp
+        received = qos.received_at(info)
+        waited = time.monotonic() - received
+        self.stamp_age = self._node.get_clock().now().nanoseconds * 1e-9 - waited - stamp
         source = self._publishers.source(ours, info["publication_sequence_number"], time.monotonic())
         self._newest.pop(names, None)  # the order is that in which they came
         self._newest[names] = JointState(
-            names, message.position, message.velocity, stamp, qos.received_at(info), message.effort, source
+            names, message.position, message.velocity, stamp, received, message.effort, source
         )
         return True
 
     def take(self) -> list[JointState]:
-        """Return what has come since the last time."""
+        """Return what was heard since the last time."""
         states, self._newest = list(self._newest.values()), {}
         return states
 

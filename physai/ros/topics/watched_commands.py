@@ -9,6 +9,7 @@ from std_msgs.msg import Empty
 
 from physai.ros.topics import qos
 from physai.ros.topics.commands import JointCommands
+from physai.ros.topics.unawaited import Unawaited, nobody, waiting
 from physai.signals import Quantity
 
 
@@ -30,19 +31,13 @@ class WatchedCommands(JointCommands):
         super().__init__(node, joints, quantity, f"{watchdog}/commands")
         # There from the start: what has to be found first is late.
         self._past = JointCommands(node, joints, quantity, partners=f"{watchdog}/heartbeat")
-        node.create_subscription(
-            Empty,
-            f"{watchdog}/heartbeat",
-            self._take_heartbeat,  # type: ignore[arg-type]  # rclpy also takes callbacks with two arguments
-            qos.SENSOR,
+        self._heartbeat = node.create_subscription(
+            Empty, f"{watchdog}/heartbeat", nobody, qos.SENSOR, callback_group=Unawaited()
         )
         self.timeout = timeout
         self._name = watchdog
         self._last = -math.inf
         self._answering = False
-
-    def _take_heartbeat(self, _: Empty, info: dict[str, int]) -> None:
-        self._last = qos.received_at(info)
 
     @property
     def rival(self) -> str | None:
@@ -51,6 +46,8 @@ class WatchedCommands(JointCommands):
 
     def silence(self, now: float) -> str | None:
         """That the watchdog does not answer at a time, s; or None."""
+        for _, info in waiting(self._heartbeat):
+            self._last = qos.received_at(info)
         before, self._answering = self._answering, now - self._last <= self.timeout
         self.silences += before and not self._answering
         return None if self._answering else f"the watchdog {self._name} does not answer, or waits for its ~/reset"
