@@ -158,7 +158,10 @@ def measure_evidence(
 def _train_all(
     arm: str, seed: int, recordings: Sequence[Path], folder: Path, overrides: Sequence[str]
 ) -> Iterator[tuple[str, list[Path]]]:
-    """Train in each way, and say where the policies lie: one, or one for each robot that was recorded."""
+    """Train in each way, and say where the policies lie: one, or one for each robot that was recorded.
+
+    Robots that cannot be identified, for they never rest, are said.
+    """
     common = (f"env={arm}", f"seed={seed}", "export.formats=[]", "evaluation.in_a_row=0", *overrides)
     taught, learns = ((*common, *each) for each in ARMS[arm])
     for way, changes in WAYS.items():
@@ -169,10 +172,12 @@ def _train_all(
     for recording in recordings:
         result = recording.with_suffix("") / "identified.yaml"
         if not result.is_file():
-            unknowns = ",".join([*UNKNOWNS, "armature"])
-            _command(
-                "identify", f"data={recording}", f"env={arm}", f"fit=[{unknowns}]", *DRIVE, f"output={result.parent}"
-            )
+            unknowns = f"fit=[{','.join([*UNKNOWNS, 'armature'])}]"
+            try:
+                _command("identify", f"data={recording}", f"env={arm}", unknowns, *DRIVE, f"output={result.parent}")
+            except UserError as error:
+                print(f"{arm}, {IDENTIFIED}: left out: {error}", flush=True)
+                return
         own.append(_train(folder / recording.stem, *taught, *DRIVE, f"randomization={result}"))
     yield IDENTIFIED, own
 
@@ -241,4 +246,4 @@ def _interval(values: np.ndarray) -> str:
     if not values.std():
         return ""
     low, high = stats.t.interval(0.95, len(values) - 1, values.mean(), values.std(ddof=1) / len(values) ** 0.5)
-    return f" ({low:.1f} to {high:.1f})"
+    return f" ({max(low, 0.0):.1f} to {min(high, 100.0):.1f})"
