@@ -1,7 +1,7 @@
-"""What it is worth to know one's robot: policies trained in six ways, on robots that none of them has met.
+"""What it is worth to know one's robot: policies trained in six ways, on robots that differ from its description.
 
-They learn in PyBullet, whose motors bring all joints to their velocities together; or with drives, each of which pulls
-at its own joint. The hidden robots live in MuJoCo, have drives and rotors, and respond late.
+They learn in PyBullet, whose motors bring all joints to their velocities together; or in MuJoCo with drives, each of
+which pulls at its own joint. The hidden robots live there, have drives and rotors, and respond late.
 """
 
 import json
@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from omegaconf import OmegaConf
 from rich.table import Table
 from scipy import stats
 from torch import Tensor
@@ -43,7 +44,7 @@ KNOWN, KNOWN_GOALS = 3, 200  # the first of them, which are recorded
 NOMINAL_GOALS = 1000
 AXES = Axis("link_mass", "scale", 0.2, 5.0), Axis("actuator_delay", "set", 0, 5)  # of the stress map
 GRID, CELL = 6, 100
-HIDDEN = (  # what nobody has met: drives with rotors, and delays of up to a step more than in any training
+HIDDEN = (  # drives with rotors, and delays of up to a step more than in randomization=strong
     *DRIVE,
     "randomization=strong",
     "randomization.armature={distribution: uniform, low: 0.005, high: 0.02, operation: add}",
@@ -134,19 +135,20 @@ def measure_evidence(
     """
     found: dict[str, dict[str, list[Shown]]] = {}
     for arm in arms:
+        described = config_of(arm, seed, *ARMS[arm][0], *overrides).env
         hidden = config_of(arm, seed, *ARMS[arm][0], *HIDDEN, *overrides)
         draws, spec = hidden.randomization, RobotSpec.from_config(hidden.env.robot)
         robots = np.concatenate([draw(draws, ParameterLayout(spec), seed + number) for number in range(ROBOTS)])
-        recordings = [folder / f"{arm}_robot{number}.csv" for number in range(KNOWN)]
+        recordings = [folder / f"{arm}_robot{number}.csv" for number in range(seed, seed + KNOWN)]
         folder.mkdir(parents=True, exist_ok=True)
-        for number, path in enumerate(recordings):
-            seen = record(hidden.env, draws, list(draws.draws), SECONDS, seed + number).recording
+        for number, path in enumerate(recordings, seed):
+            seen = record(hidden.env, draws, list(draws.draws), SECONDS, number).recording
             write_table(seen, spec.joints, str(path))
         found[arm] = {}
         for number in range(seed, seed + seeds):
             at, maps = folder / f"{arm}_seed{number}", {}
             for way, runs in _train_all(arm, number, recordings, at, overrides):
-                shown, maps[way] = _judge(runs, hidden.env, Fleet.among(draws, robots))
+                shown, maps[way] = _judge(runs, described, hidden.env, Fleet.among(draws, robots))
                 found[arm].setdefault(way, []).append(shown)
                 settled = ", ".join(f"{np.mean(judged.settled):.1%} on {kind}" for kind, judged in shown.on.items())
                 print(f"{arm}, {way}, seed {number}: settled {settled}; map {shown.works:.1%}", flush=True)
@@ -183,7 +185,9 @@ def _train_all(
 
 
 def _train(folder: Path, *overrides: str) -> Path:
-    if not (folder / "summary.json").is_file():  # which a run writes last
+    said = folder / ".hydra" / "overrides.yaml"
+    same = said.is_file() and OmegaConf.load(said) == list(overrides)
+    if not (same and (folder / "summary.json").is_file()):  # which a run writes last
         shutil.rmtree(folder, ignore_errors=True)
         _command("train", *overrides, f"hydra.run.dir={folder}")
     return folder
@@ -195,13 +199,13 @@ def _command(module: str, *overrides: str) -> None:
         raise UserError(f"physai.{module} {' '.join(overrides)}: {done.stderr[-1000:]}")
 
 
-def _judge(runs: Sequence[Path], drives: EnvConfig, fleet: Fleet) -> tuple[Shown, Map]:
+def _judge(runs: Sequence[Path], described: EnvConfig, drives: EnvConfig, fleet: Fleet) -> tuple[Shown, Map]:
     """Judge one policy; or the first of several, and each on the robot that it was trained for."""
 
-    def policy(randomization: RandomizationConfig, env: EnvConfig | None, number: int = 0) -> TrainedPolicy:
+    def policy(randomization: RandomizationConfig, env: EnvConfig, number: int = 0) -> TrainedPolicy:
         return TrainedPolicy(runs[number % len(runs)], "best", randomization, env)
 
-    nominal = policy(RandomizationConfig.none(), None).evaluate(NOMINAL_GOALS)
+    nominal = policy(RandomizationConfig.none(), described).evaluate(NOMINAL_GOALS)
     hidden = policy(fleet, drives).evaluate(ROBOTS * GOALS)
     known = [policy(fleet.only(number), drives, number).evaluate(KNOWN_GOALS) for number in range(KNOWN)]
     on = {
@@ -217,7 +221,7 @@ def _judge(runs: Sequence[Path], drives: EnvConfig, fleet: Fleet) -> tuple[Shown
 def evidence_table(found: dict[str, dict[str, list[Shown]]]) -> Table:
     """Show means over robots and seeds; of ``settled`` its 95 % interval (Student's t over robots), too."""
     columns = ("way", "success", "settled", "worst seed", "steps to goal", "change of action")
-    shown = table("Robots that no policy was trained on", "", *columns)
+    shown = table("Policies by the way they were trained", "", *columns)
     for arm, ways in found.items():
         kinds = list(next(iter(ways.values()))[0].on)
         for kind in kinds:

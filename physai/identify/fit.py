@@ -25,6 +25,7 @@ _MOST_SPOILT = 0.34  # of the motions; if there were more, it is the model
 _ROUNDS = 3
 _PART = 0.25  # of a step of the recording: how finely a delay is found
 _EVERY = 4  # of the motions, one is held out
+_OFF = 3.0  # standard deviations by which it may have begun elsewhere than measured
 SHARE = 0.1  # of the largest in a direction, from which a parameter has a part in it
 _TOLD = 0.3  # units; a parameter of which less is known cannot be told
 _SLOPES = 0.025  # relative error that slopes from differences may have
@@ -145,7 +146,7 @@ class Predictor:
 
 
 def fit(predict: Predictor, trials: Trials, unknowns: Unknowns, longest: int, seed: int, told: Told) -> Fit:
-    """Least squares from several starts, with each delay; bounded, by trust regions (scipy's ``least_squares``).
+    """Least squares from several starts, with delays about the best; bounded, by trust regions (``least_squares``).
 
     Errors far beyond those of most motions count less at first (Huber, 1964), and motions full of them are left out: a
     computer that was too late has spoilt them. Slopes come from one rollout in which each unknown is changed in a robot
@@ -155,8 +156,8 @@ def fit(predict: Predictor, trials: Trials, unknowns: Unknowns, longest: int, se
         predict: Of the trials.
         trials: What the robot did.
         unknowns: What to find.
-        longest: Delay of the actuators that is tried, in control steps: up to it all that are whole steps of the
-            recording, and fractions of a step about the best.
+        longest: Delay of the actuators that is tried, in control steps: up to it whole steps of the recording, and
+            fractions of a step about the best.
         seed: Draws starts.
         told: Is told what goes on.
     """
@@ -180,7 +181,7 @@ def fit(predict: Predictor, trials: Trials, unknowns: Unknowns, longest: int, se
 
     for _ in range(_ROUNDS):
         problem.set_doubt(best, at)
-        found = _downhill(at, delays, partial(tried, best.x))
+        found = _downhill(at, delays, partial(tried, best.x), max(1, round(predict.per_control_step / 2)))
         result, at = min(found, key=_cost)
         best, at = problem.solve(result.x, at, _MORE)
         if not problem.leave_out(best, at):
@@ -197,11 +198,12 @@ def fit(predict: Predictor, trials: Trials, unknowns: Unknowns, longest: int, se
 
 
 def _downhill(
-    start: float, delays: Collection[float], solve: Callable[[float], tuple[OptimizeResult, float]]
+    start: float, delays: Collection[float], solve: Callable[[float], tuple[OptimizeResult, float]], reach: int
 ) -> list[tuple[OptimizeResult, float]]:
-    """Solve with a delay, and with its neighbors until none is better: costs rise on both sides of the right one."""
+    """Solve with a delay, and with those near it until none is better: costs rise on both sides of the right one."""
     best, found = start, {start: solve(start)}
-    while untried := [at for at in (best - 1, best + 1) if at in delays and at not in found]:
+    near = range(-reach, reach + 1)
+    while untried := [at for way in near if (at := best + way) in delays and at not in found]:
         found |= {at: solve(at) for at in untried}
         best = min(found, key=lambda at: _cost(found[at]))
     return list(found.values())
@@ -316,7 +318,8 @@ class _Problem:
     def _begun(self, coordinates: np.ndarray, delay: float) -> np.ndarray:
         """Find where the motions held out began, too, with the robot as it is; two steps of Gauss and Newton.
 
-        Of them as of the others, a mean of few noisy positions says it only roughly, which counts as one unit.
+        A mean of few noisy positions says it only roughly. No motion is moved by more than such a mean may be off: what
+        the robot does not explain is not to be explained by that.
         """
         size, joints = len(self._unknowns), self._trials.start.shape[1]
         coordinates, changes = coordinates.copy(), np.zeros((1 + joints, len(coordinates)))
@@ -330,6 +333,7 @@ class _Problem:
                 slopes = np.stack(changed, axis=1) - now[:, None]
                 away = slopes.T @ now + starts[trial]
                 starts[trial] -= np.linalg.solve(slopes.T @ slopes + np.eye(joints), away)
+            np.clip(starts, -_OFF, _OFF, out=starts)
         return coordinates
 
     def judge(self, result: OptimizeResult, delay: float) -> Fit:

@@ -180,6 +180,7 @@ class InferenceNode(StoppableNode[InferenceConfig]):
         latched = self._controller.reset()
         if latched:
             self._goal = None
+        self._robot.hear()
         self._tick()
         self._stop_file.forget()
         said = "waiting for a new goal" if latched else "nothing to reset"
@@ -203,10 +204,10 @@ class InferenceNode(StoppableNode[InferenceConfig]):
         now = time.monotonic()
         if now - self._answered > 1.5 / self.config.rate_hz:
             self._timing.tick(now)
+            self._robot.hear()
             self._tick()
 
     def _tick(self) -> None:
-        self._robot.hear()
         now = time.monotonic()
         interlocks = self._interlocks(now)
         goal, self._goal = self._goal, None

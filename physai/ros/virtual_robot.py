@@ -95,6 +95,8 @@ class VirtualRobot(StoppableNode[VirtualRobotConfig]):
             )
 
     def _reset(self) -> tuple[bool, str]:
+        for _ in waiting(self._commands):  # of before
+            pass
         self._controller.activate()
         self._arm.reset()
         return True, "at home"

@@ -2,9 +2,13 @@
 
 import json
 import shutil
+from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import torch
+from omegaconf import OmegaConf
 from rich.console import Console
 
 from physai.bench import evidence
@@ -19,14 +23,27 @@ def _few_of_all(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.slow
-def test_every_way_is_judged_on_every_kind_of_robot_and_a_run_that_lies_there_is_kept(exported_run, tmp_path):
+def test_every_way_is_judged_on_every_kind_of_robot_and_a_run_that_lies_there_is_kept(
+    exported_run, tmp_path, monkeypatch
+):
     """One training of seconds, and policies that were there: it is the judging that nothing else sees."""
-    for name in ("teacher", "adaptive", "reacher_robot0", "reacher_robot1"):
-        shutil.copytree(exported_run, tmp_path / "reacher_seed0" / name)
     for robot in range(2):
         (tmp_path / f"reacher_robot{robot}").mkdir()
         (tmp_path / f"reacher_robot{robot}" / "identified.yaml").touch()
+    trained, command = [], evidence._command
+
+    def as_if(module, *overrides):
+        """Train for real in the first way; in the others take what is there."""
+        folder = Path(overrides[-1].partition("=")[2])
+        trained.append(folder.name)
+        if folder.name == "default":
+            command(module, *overrides)
+        else:
+            shutil.copytree(exported_run, folder)
+
+    monkeypatch.setattr(evidence, "_command", as_if)
     found = evidence.measure_evidence(0, 1, tmp_path, ("reacher",), TINY)
+    assert trained == ["default", "teacher", "adaptive", "reacher_robot0", "reacher_robot1"]
     assert list(found["reacher"]) == ["default", "adaptive", "identified, drives"]
     for shown in (each for ways in found["reacher"].values() for each in ways):
         assert [len(judged.settled) for judged in shown.on.values()] == [1, 3, 2]
@@ -38,11 +55,30 @@ def test_every_way_is_judged_on_every_kind_of_robot_and_a_run_that_lies_there_is
         found["reacher"]["default"][0].works
     )
     assert (tmp_path / "reacher_seed0" / "stress.png").stat().st_size > 10_000
+    again = evidence._train(tmp_path / "reacher_seed0" / "default", *_overrides(tmp_path / "reacher_seed0" / "default"))
+    assert again.name == "default"
+    assert len(trained) == 5
     console = Console(width=180, record=True)
     console.print(evidence.evidence_table(found))
     shown = console.export_text()
     for part in ("reacher, the robot as described", "reacher, 3 hidden robots", "adaptive", "identified, drives"):
         assert part in shown
+
+
+def _overrides(run: Path) -> list[str]:
+    return list(OmegaConf.load(run / ".hydra" / "overrides.yaml"))
+
+
+def test_episodes_are_sorted_by_robot():
+    two = SimpleNamespace(
+        success=torch.tensor([True, True, True, False]),
+        settled=torch.tensor([True, False, False, False]),
+        length=torch.tensor([10, 20, 30, 50]),
+        action_change=torch.tensor([[0.0, 2.0], [0.0, 2.0], [1.0, 3.0], [1.0, 3.0]]),
+    )
+    judged = evidence.Judged.of([two], 2)
+    assert (judged.success, judged.settled) == ([1.0, 0.5], [0.5, 0.0])
+    assert (judged.steps, judged.change) == ([15.0, 40.0], [1.0, 2.0])
 
 
 def test_each_robot_of_a_fleet_gets_the_same_number_of_episodes_one_after_the_other(reacher):

@@ -2,12 +2,13 @@
 
 import dataclasses
 from contextlib import closing
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from physai.bench.hidden import NOISE, record
-from physai.identify.fit import Predictor, fit
+from physai.identify.fit import Predictor, _downhill, fit
 from physai.identify.trials import cut
 from physai.identify.unknowns import Unknowns
 from physai.physics import ParameterLayout
@@ -123,3 +124,16 @@ def test_motions_in_which_commands_came_late_are_left_out_and_named(env_config, 
     assert result.explained
     truth = hidden.parameters[hidden.layout.columns["velocity_gain"]]
     np.testing.assert_allclose(result.values[:2], truth, atol=0.02)
+
+
+def test_delays_are_tried_as_long_as_one_near_the_best_is_better():
+    def solve(delay):
+        tried.append(delay)
+        return SimpleNamespace(cost=abs(delay - 5)), delay
+
+    for reach, farthest in ((1, 6), (2, 7)):
+        tried: list[int] = []
+        found = _downhill(2, range(12), solve, reach)
+        assert min(found, key=lambda each: each[0].cost)[1] == 5
+        assert max(tried) == farthest
+        assert len(tried) == len(set(tried))

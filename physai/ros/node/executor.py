@@ -22,15 +22,17 @@ class Executor(executors.Executor):
 
     rclpy's single-threaded executor gathers all that it waits for anew before each callback, and again after it, which
     costs more than most callbacks do. This one does so when something was made or destroyed, and after a wait it calls
-    all who are ready: messages come first, so that a timer knows the newest. Callbacks are plain functions, and things
-    are made and destroyed in the thread that spins.
+    all who are ready: messages come first, so that a timer knows the newest. Callbacks are plain functions, there are
+    no tasks and no actions, and things are made and destroyed in the thread that spins.
 
     Args:
         node: Whose callbacks they are.
+        ends: Whether nobody is to be called any more, also of those who are ready.
     """
 
-    def __init__(self, node: Node) -> None:
+    def __init__(self, node: Node, ends: Callable[[], bool] = lambda: False) -> None:
         super().__init__(context=node.context)
+        self._ends = ends
         self._node = node
         self._changed = True
         self._looked = time.monotonic()
@@ -41,6 +43,10 @@ class Executor(executors.Executor):
         self._changed = True
         super().wake()
 
+    def create_task(self, callback: Any, *args: Any, **kwargs: Any) -> Any:
+        """There are no tasks: nobody would run them."""
+        raise NotImplementedError
+
     def spin_once(self, timeout_sec: float | None = None) -> None:
         """Wait until something is ready, for so long at most, and call whoever it is for.
 
@@ -50,6 +56,8 @@ class Executor(executors.Executor):
         guard, context = self._guard, self._context.handle
         if self._is_shutdown or guard is None or context is None:
             return
+        if not self._context.ok():
+            raise executors.ExternalShutdownException
         if self._changed:
             self._changed = False
             self._gather()
@@ -64,7 +72,9 @@ class Executor(executors.Executor):
             raise executors.ExternalShutdownException
         for kind, works in self._works.items():
             for pointer in waits.get_ready_entities(kind):
-                if pointer in works and not self._is_shutdown:
+                if self._is_shutdown or self._ends():
+                    return
+                if pointer in works:
                     _work(*works[pointer])
         if time.monotonic() - self._looked > _LOOK:
             self._looked = time.monotonic()
@@ -127,7 +137,9 @@ def _take_message(subscription: Subscription) -> Callable[[], object] | None:
     return partial(subscription.callback, *taken[:1] if alone else taken)
 
 
-def _take_timer(timer: Timer) -> Callable[[], object]:
+def _take_timer(timer: Timer) -> Callable[[], object] | None:
+    if not timer.handle.is_timer_ready():  # who was called before has cancelled it
+        return None
     timer.handle.call_timer()
     return timer.callback
 

@@ -145,7 +145,7 @@ def _run(make_node: Callable[[], StoppableNode[P]], caught: Mapping[int, object]
         return 1
     gc.collect()
     gc.freeze()  # to look for garbage in all that is imported would hold up every command for a tenth of a second
-    executor = Executor(node)
+    executor = Executor(node, lambda: node.stopped or bool(caught))
     last_words = ""
     try:
         while not node.stopped and not caught:

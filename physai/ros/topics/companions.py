@@ -40,7 +40,10 @@ class Companions:
         with self._node.handle:
             count = self._node.handle.get_count_publishers(self._topic)
         now = time.monotonic()
-        if count <= 1 or (count == len(self._allowed) and now - self._looked < _LOOK):
+        if count <= 1:
+            self._allowed = []
+            return []
+        if count == len(self._allowed) and now - self._looked < _LOOK:
             return []
         self._looked = now
         found = self._publishers(self._topic)
