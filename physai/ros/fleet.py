@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 _FOREVER = 1e9  # s
 _PATIENCE = 60.0  # s, for the dashboard to start
-_PER_CORE = 4  # arms of two joints, with their nodes
+_PER_CORE = 3  # arms of two joints, with their nodes
 _MOST = 9  # arms: more processes than that do not find each other on one computer's loopback
 
 
