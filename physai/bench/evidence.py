@@ -196,7 +196,7 @@ def _train(folder: Path, *overrides: str) -> Path:
 def _command(module: str, *overrides: str) -> None:
     done = subprocess.run([sys.executable, "-m", f"physai.{module}", *overrides], capture_output=True, text=True)
     if done.returncode:
-        raise UserError(f"physai.{module} {' '.join(overrides)}: {done.stderr[-1000:]}")
+        raise UserError(f"physai.{module} {' '.join(overrides)}: {done.stderr.strip()[-200:]}")
 
 
 def _judge(runs: Sequence[Path], described: EnvConfig, drives: EnvConfig, fleet: Fleet) -> tuple[Shown, Map]:
