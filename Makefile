@@ -64,7 +64,7 @@ test: $(VENV)/.installed-dev chromium  ## Run all tests (ARGS="-m 'not slow'" fo
 	part "what measures time, two at a time and nothing else" tests/ros tests/bench -n 2 --dist worksteal --realtime=only
 
 bench: $(VENV)/.installed-dev  ## Measure speed against bare PyBullet, rclpy and Stable-Baselines3
-	@echo "==> Measuring (all of it takes more than two hours; ARGS=--collection and the like choose a part)"
+	@echo "==> Measuring (all of it takes several hours; ARGS=--collection and the like choose a part)"
 	$(BIN)/python -m physai.bench $(ARGS)
 
 check: $(VENV)/.installed-dev  ## Check format, lint, types and the direction of imports

@@ -70,7 +70,7 @@ def _options() -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         prog="python -m physai.bench",
         description="Measure physai on the two-link arm, a Panda and legs, side by side with what it is compared to: "
-        "the parts that are named, or all of them, which takes more than two hours.",
+        "the parts that are named, or all of them, which takes several hours.",
     )
     for part, meaning in PARTS.items():
         parser.add_argument(f"--{part}", dest="parts", action="append_const", const=part, help=meaning)
