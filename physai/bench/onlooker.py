@@ -5,6 +5,7 @@ import math
 import threading
 import time
 from collections.abc import Sequence
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -12,13 +13,31 @@ import viser
 import zstandard
 from viser import _messages
 from websockets.exceptions import ConnectionClosed
-from websockets.sync.client import connect
+from websockets.sync.client import ClientConnection, connect
 
 _HEADER = 16  # bytes before the compressed part of a frame; the last eight are its length
 _SAME = 1e-4  # rad: viser does not even send such changes
 _CAMERA = _messages.ViewerCameraMessage(
     (1.0, 0.0, 0.0, 0.0), (1.0, 1.0, 1.0), 1.0, 0.1, 10.0, 100, 100, (0.0, 0.0, 0.0), (0.0, 0.0, 1.0)
 )
+
+
+def look_at(host: str, port: int, **options: Any) -> ClientConnection:
+    """Connect to one of viser's pages as its own script does, and say where one looks from: then it shows something.
+
+    Args:
+        host: Of the page.
+        port: Of the page.
+        **options: Of the connection, in the place of those of a browser.
+    """
+    as_browsers = {
+        "origin": f"http://{host}:{port}",
+        "subprotocols": [f"viser-v{viser.__version__}"],
+        "max_size": None,
+    }
+    socket = connect(f"ws://{host}:{port}", **(as_browsers | options))
+    socket.send(msgspec.msgpack.encode(_CAMERA.as_serializable_dict()))
+    return socket
 
 
 class Onlooker:
@@ -30,13 +49,7 @@ class Onlooker:
     """
 
     def __init__(self, host: str, port: int) -> None:
-        self._socket = connect(
-            f"ws://{host}:{port}",
-            origin=f"http://{host}:{port}",  # type: ignore[arg-type]
-            subprotocols=[f"viser-v{viser.__version__}"],  # type: ignore[list-item]
-            max_size=None,
-        )
-        self._socket.send(msgspec.msgpack.encode(_CAMERA.as_serializable_dict()))
+        self._socket = look_at(host, port)
         self._frames: list[tuple[int, bytes]] = []
         threading.Thread(target=self._look, daemon=True).start()
 

@@ -3,13 +3,9 @@
 from typing import Any
 
 import msgspec
-import viser
 from viser import _messages
-from websockets.sync.client import ClientConnection, connect
 
-CAMERA = _messages.ViewerCameraMessage(
-    (1.0, 0.0, 0.0, 0.0), (1.0, 1.0, 1.0), 1.0, 0.1, 10.0, 100, 100, (0.0, 0.0, 0.0), (0.0, 0.0, 1.0)
-)
+from physai.bench.onlooker import look_at
 
 
 class Visitor:
@@ -24,15 +20,9 @@ class Visitor:
     """
 
     def __init__(self, host: str, port: int, origin: str | None = None, cookie: str = "", **options: Any) -> None:
-        self.socket: ClientConnection = connect(
-            f"ws://{host}:{port}",
-            origin=origin or f"http://{host}:{port}",  # type: ignore[arg-type]
-            additional_headers={"Cookie": cookie} if cookie else {},
-            subprotocols=[f"viser-v{viser.__version__}"],  # type: ignore[list-item]
-            max_size=None,
-            **options,
-        )
-        self.say(CAMERA)
+        as_claimed = {"origin": origin} if origin else {}
+        cookies = {"additional_headers": {"Cookie": cookie}} if cookie else {}
+        self.socket = look_at(host, port, **as_claimed, **cookies, **options)
 
     def say(self, message: Any) -> None:
         self.socket.send(msgspec.msgpack.encode(message.as_serializable_dict()))
