@@ -44,8 +44,9 @@ class MuJoCoPhysics:
     - ``impulse`` is PyBullet's motor and integration (:mod:`physai.physics.impulse`), so robots move as in
       :class:`physai.physics.pybullet.PyBulletPhysics`, friction included.
     - ``servo`` is how a drive behaves: an effort in proportion to the missing velocity closes in on it with a time
-      constant, whatever the pose; dry friction resists; limits of joints are as soft as MuJoCo has them. It takes as
-      many steps a period as the time constant asks for.
+      constant, whatever the pose; the weight of the robot as described is carried, whatever the velocity, as arms in
+      space do, but nothing that a robot has more or less of; dry friction resists; limits of joints are as soft as
+      MuJoCo has them. It takes as many steps a period as the time constant asks for.
 
     Args:
         spec: The robot.
@@ -89,6 +90,8 @@ class MuJoCoPhysics:
         self._unit_inertia = model.body_inertia[self._links] / np.where(mass > 0, mass, 1.0)[self._links, None]
         self._mass, self._inertia = self._batch.expand("body_mass"), self._batch.expand("body_inertia")
         self._damping, self._armature = self._batch.expand("dof_damping"), self._batch.expand("dof_armature")
+        self._described = loaded_mass(spec, nominal_dynamics(spec))
+        self._carried: np.ndarray | None = None
         self._motor: _Impulse | _Servo | _Springs
         if spec.servo is not None:
             self._motor = _Springs(self._batch, substeps, joints)
@@ -96,6 +99,7 @@ class MuJoCoPhysics:
             self._motor = _Impulse(spec, self._batch, substeps)
         else:
             self._motor = _Servo(self._batch, substeps, control_dt, motor_time_constant)
+            self._carried = self._batch.expand("body_gravcomp")
         self._parameters = {key: np.repeat(value, num_robots, axis=0) for key, value in nominal_dynamics(spec).items()}
         self.reset(np.arange(num_robots), at_home(spec, num_robots), self._parameters)
 
@@ -112,6 +116,8 @@ class MuJoCoPhysics:
         mass = loaded_mass(self._spec, {key: value[rows] for key, value in self._parameters.items()})
         self._mass[rows[:, None], self._links] = mass
         self._inertia[rows[:, None], self._links] = mass[:, :, None] * self._unit_inertia
+        if self._carried is not None:  # the described weight, as a share of what each body weighs
+            self._carried[rows[:, None], self._links] = self._described / np.where(mass > 0, mass, 1.0)
         joints = slice(-len(self._spec.joints), None)
         self._damping[rows, joints] = self._parameters["joint_damping"][rows]
         self._armature[rows, joints] = self._parameters["armature"][rows]
@@ -220,16 +226,19 @@ class _Servo:
         self._own = batch.model.M_rowadr + batch.model.M_rownnz - 1  # the diagonal of the mass matrix
         self._time_constant = np.zeros(batch.bind("qpos").shape)
         self._given, self._resisted = batch.bind("qfrc_actuator"), batch.bind("qfrc_constraint")
+        self._carrying, self._strongest = batch.bind("qfrc_gravcomp"), np.zeros(self._time_constant.shape)
         self.effort = np.zeros(self._time_constant.shape)
 
     def set(self, rows: np.ndarray, parameters: DynamicsParameters) -> None:
-        self._friction[rows] = parameters["joint_friction"]
-        self._effort[rows, :, 0], self._effort[rows, :, 1] = -parameters["effort_limit"], parameters["effort_limit"]
+        self._friction[rows], self._strongest[rows] = parameters["joint_friction"], parameters["effort_limit"]
         gain = np.clip(parameters["velocity_gain"], 1e-6, 1.0)
         self._time_constant[rows] = self._fastest + self._dt * (1.0 - gain) / gain
 
     def step(self, command: np.ndarray) -> None:
-        self._batch.forward(stage=int(mujoco.mjtStage.mjSTAGE_POS))
+        self._batch.forward(stage=int(mujoco.mjtStage.mjSTAGE_VEL))
+        # One effort carries the weight and drives; MuJoCo limits what drives.
+        self._effort[:, :, 0] = -self._strongest - self._carrying
+        self._effort[:, :, 1] = self._strongest - self._carrying
         gain = self._mass[:, self._own] / self._time_constant
         self._gain[:, :, 0], self._bias[:, :, 2] = gain, -gain
         self._batch.ctrl = command
@@ -271,6 +280,10 @@ def _make_model(spec: RobotSpec, motor: str, time_step: float) -> "mujoco.MjMode
                 actuator = made.add_actuator(name=joint.name, target=joint.name)
                 actuator.trntype, actuator.biastype = mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtBias.mjBIAS_AFFINE
                 actuator.forcelimited, actuator.forcerange = True, [-1.0, 1.0]
+                joint.actgravcomp = spec.servo is None
+        if motor == "servo" and spec.servo is None:
+            for body in made.bodies:
+                body.gravcomp = 1.0
         if spec.floating is not None:
             put_on_floor(made, spec.floating, spec.base)
         model = made.compile()
