@@ -126,9 +126,8 @@ class Predictor:
         each = np.repeat(parameters, len(trials), axis=0)
         offset = each[:, self._layout.columns["encoder_offset"]]
         true = start.reshape(robots, joints) - offset
-        physics.reset(
-            np.arange(robots), RobotState(true, np.zeros_like(true)), self._layout.dynamics(each, self.per_control_step)
-        )
+        state = RobotState(true, np.tile(trials.velocity, (rows, 1)))
+        physics.reset(np.arange(robots), state, self._layout.dynamics(each, self.per_control_step))
         given = np.concatenate([np.repeat(trials.before[None], math.ceil(delay), axis=0), trials.command])
         late = math.ceil(delay) - delay  # of a step, in which the newer of two commands is in force
         arrives = given if late == 0.0 else (1.0 - late) * given[:-1] + late * given[1:]

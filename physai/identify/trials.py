@@ -1,4 +1,4 @@
-"""Motions that begin at rest, cut out of a recording: what an identification predicts."""
+"""Motions that begin at rest or at a steady speed, cut out of a recording: what an identification predicts."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,12 +9,13 @@ import numpy as np
 from physai.errors import UserError
 from physai.identify.recording import Recording
 
-_STILL = 0.5  # s with one command, after which a robot has come to rest
+_STILL = 0.5  # s with one command, after which a robot has come to rest, or to a steady speed
 _MEAN = 0.24  # s of this, whose mean is where a motion begins
 _LONGEST = 4.0  # s; farther ahead, small errors grow and say little of parameters
 _SHORTEST = 0.2  # s
 _CREEPS = 4.0  # standard deviations of what noise does to a mean; and at least, rad and rad/s:
 _RESTING = np.array([2e-4, 2e-3])
+_STEADY = 0.1  # of a speed, by which it may change in this time: an arm that sinks is never quite steady
 _FEWEST, _MOST = 2, 40  # motions: one to learn from, one to judge by; and more hardly tell more
 _LEAST_NOISE = np.array([1e-5, 1e-4])  # rad, rad/s; encoders resolve no more
 _LEAST_SHARE = 0.01  # of the largest effort, to which it is known: sensors of torque have errors of scale, too
@@ -28,23 +29,25 @@ class Trials:
     Attributes:
         period: From step to step, s.
         begins: When the motions begin, s from the beginning of the recording, [B].
-        start: Where the encoders said that the robot stood, rad, [B, n].
+        start: Where the encoders said that the robot was, rad, [B, n].
+        velocity: How fast it was, rad/s, [B, n]: zeros if it stood.
         before: The command until then, [B, n].
         command: In force from each step to the next, [T, B, n]; finite.
         measured: Positions, rad, velocities, rad/s, and efforts, N·m, after each of these steps, [3, T, B, n].
-        noise: Standard deviations of these while the robot stood still, [3, n]; of efforts 1 % of the largest.
-        start_noise: Standard deviation of ``start``, which is a mean of few, rad.
+        noise: Standard deviations of these before the motions, [3, n]; of efforts 1 % of the largest.
+        start_noise: Standard deviations of ``start``, which comes from few measurements, rad, [B, 1].
         left_out: Parts of the recording that could not be used, in words.
     """
 
     period: float
     begins: np.ndarray
     start: np.ndarray
+    velocity: np.ndarray
     before: np.ndarray
     command: np.ndarray
     measured: np.ndarray
     noise: np.ndarray
-    start_noise: float
+    start_noise: np.ndarray
     left_out: tuple[str, ...]
 
     def __len__(self) -> int:
@@ -52,10 +55,10 @@ class Trials:
 
 
 def cut(recording: Recording, name: str, joints: Sequence[str]) -> Trials:
-    """Cut a recording wherever the robot has come to rest.
+    """Cut a recording wherever the robot has come to rest, or to a steady speed, as an arm that sinks.
 
     Args:
-        recording: At least two motions, each after half a second of rest.
+        recording: At least two motions, each after half a second with one command.
         name: Of the recording, for messages.
         joints: Their names.
 
@@ -65,16 +68,16 @@ def cut(recording: Recording, name: str, joints: Sequence[str]) -> Trials:
     motions, left_out = _motions(recording)
     if len(motions) < _FEWEST:
         raise UserError(
-            f"{name}: {len(motions)} motions begin at rest, and at least {_FEWEST} are needed: keep one command for "
-            f"{_STILL:g} s before each{''.join(f'; {each}' for each in left_out)}"
+            f"{name}: {len(motions)} motions begin at rest or at a steady speed, and at least {_FEWEST} are needed: "
+            f"keep one command for {_STILL:g} s before each{''.join(f'; {each}' for each in left_out)}"
         )
     if len(motions) > _MOST:
         left_out.append(f"all but {_MOST} of {len(motions)} motions, spread over the whole time")
         motions = [motions[number] for number in np.linspace(0, len(motions) - 1, _MOST).round().astype(int)]
-    degrees = sum(len(each.rest[0]) - 1 for each in motions)
-    squares = np.sum([np.square(_about_mean(each.rest)).sum(axis=1).mean(axis=1) for each in motions], axis=0)
+    degrees = sum(each.begin.degrees for each in motions)
+    squares = np.sum([each.begin.squares for each in motions], axis=0)
     noise = np.tile(np.maximum(np.sqrt(squares / degrees), _LEAST_NOISE)[:, None], len(joints))
-    start = np.stack([each.rest[0].mean(axis=0) for each in motions])
+    start, velocity = (np.stack([getattr(each.begin, key) for each in motions]) for key in ("position", "velocity"))
 
     longest = max(each.last - each.first for each in motions)
     command = np.empty((longest, len(motions), len(joints)))
@@ -93,15 +96,26 @@ def cut(recording: Recording, name: str, joints: Sequence[str]) -> Trials:
     before = recording.command[[each.first - 1 for each in motions]]
     largest = np.nanmax(np.nan_to_num(np.abs(recording.effort)), axis=0)
     noise = np.concatenate([noise, [np.maximum(_LEAST_SHARE * largest, 1e-9)]])
-    start_noise = float(noise[0, 0] / np.sqrt(np.mean([len(each.rest[0]) for each in motions])))
-    return Trials(recording.period, begins, start, before, command, measured, noise, start_noise, tuple(left_out))
+    start_noise = noise[0, 0] * np.array([[each.begin.spread] for each in motions])
+    return Trials(
+        recording.period, begins, start, velocity, before, command, measured, noise, start_noise, tuple(left_out)
+    )
 
 
 @dataclass(frozen=True)
 class _Motion:
     first: int  # step in which the command changes
     last: int  # the first step that does not belong to it
-    rest: np.ndarray  # what was measured just before, [2, k, n]
+    begin: "_Begin"
+
+
+@dataclass(frozen=True)
+class _Begin:
+    position: np.ndarray  # rad, [n]
+    velocity: np.ndarray  # rad/s, [n]
+    spread: float  # standard deviation of the position, in those of the sensor
+    squares: np.ndarray  # of what noise left of positions and velocities, a mean over the joints, [2]
+    degrees: int  # of freedom of these, for each joint
 
 
 def _motions(recording: Recording) -> tuple[list[_Motion], list[str]]:
@@ -122,33 +136,47 @@ def _motions(recording: Recording) -> tuple[list[_Motion], list[str]]:
         if len(unknown):
             last = first + int(unknown[0])
             left_out.append(f"{at}: no command is known from {last * recording.period:.2f} s on")
-        rest = _measured(recording)[:, first - mean + 1 : first + 1]
-        rest = rest[:, np.isfinite(rest).all(axis=(0, 2))]
+        measured = _measured(recording)[:, first - mean + 1 : first + 1]
+        known_at = np.isfinite(measured).all(axis=(0, 2))
         if last - first < shortest:
             left_out.append(f"{at}: too short")
-        elif len(rest[0]) < max(mean // 2, 4):
-            left_out.append(f"{at}: too little was measured at rest")
-        elif not _rests(rest):
-            left_out.append(f"{at}: the robot still moves when it begins")
+        elif known_at.sum() < max(mean // 2, 4):
+            left_out.append(f"{at}: too little was measured before it")
+        elif (begin := _begin(measured[:, known_at], recording.period * (np.flatnonzero(known_at) - mean + 1))) is None:
+            left_out.append(f"{at}: its speed still changes when it begins")
         else:
-            motions.append(_Motion(first, last, rest))
+            motions.append(_Motion(first, last, begin))
     return motions, left_out
 
 
-def _rests(measured: np.ndarray) -> bool:
-    """Whether the two halves of what was measured, [2, k, n], differ by no more than noise makes them."""
-    half = len(measured[0]) // 2
+def _begin(measured: np.ndarray, time: np.ndarray) -> _Begin | None:
+    """Say how a motion begins at time 0, or None if that is not known.
+
+    The two halves of a robot that rests differ by no more than noise makes them. Those of one with a steady speed
+    differ by the way that it makes at this speed.
+
+    Args:
+        measured: What was measured before, [2, k, n].
+        time: When, [k].
+    """
+    half, count = len(time) // 2, len(time)
     first, second = measured[:, :half], measured[:, half : 2 * half]
     noise = np.sqrt((first.var(axis=1, ddof=1) + second.var(axis=1, ddof=1)) / half)  # of the difference of means
-    creeps = np.abs(second.mean(axis=1) - first.mean(axis=1)) > np.maximum(_CREEPS * noise, _RESTING[:, None])
-    moves = np.abs(measured[1].mean(axis=0)) > np.maximum(_CREEPS * noise[1], _RESTING[1])
-    return not (creeps[0].any() or moves.any())
+    change, speed = second.mean(axis=1) - first.mean(axis=1), measured[1].mean(axis=0)
+    noise = np.maximum(_CREEPS * noise, _RESTING[:, None])
+    if (np.abs(change[0]) <= noise[0]).all() and (np.abs(speed) <= noise[1]).all():
+        squares = np.square(measured - measured.mean(axis=1, keepdims=True)).sum(axis=1).mean(axis=1)
+        return _Begin(measured[0].mean(axis=0), np.zeros_like(speed), count**-0.5, squares, count - 1)
+    way = time[half : 2 * half].mean() - time[:half].mean()
+    noise += _STEADY * np.abs(speed) * np.array([[way], [1.0]])
+    if (np.abs(change - [way * speed, np.zeros_like(speed)]) > noise).any():
+        return None
+    lines = np.stack([np.ones(count), time], axis=1)
+    solve = np.linalg.pinv(lines)
+    (position, velocity), spread = solve @ measured[0], float(np.linalg.norm(solve[0]))
+    left = np.stack([values - lines @ (solve @ values) for values in measured])
+    return _Begin(position, velocity, spread, np.square(left).sum(axis=1).mean(axis=1), count - 2)
 
 
 def _measured(recording: Recording) -> np.ndarray:
     return np.stack([recording.position, recording.velocity])
-
-
-def _about_mean(values: np.ndarray) -> np.ndarray:
-    centred: np.ndarray = values - values.mean(axis=1, keepdims=True)
-    return centred

@@ -93,17 +93,43 @@ def test_motions_begin_where_commands_change_after_a_rest(hidden):
     assert np.isfinite(trials.measured).any(axis=(0, 1, 3)).all()
 
 
-def test_who_moves_steadily_does_not_rest(hidden):
-    """One velocity command for long is no rest."""
+def moving_before(hidden, speed, told):
+    """The first motion begins at a speed; whether the velocities that were measured say so, too."""
     recording = hidden.recording
-    command, position = recording.command.copy(), recording.position.copy()
-    first = int(np.flatnonzero(command.any(axis=1))[0])
-    whole = cut(recording, "robot", hidden.spec.joints)
-    command[:first] = 0.5
-    position[:first] -= 0.5 * recording.period * np.arange(first, 0, -1)[:, None]
-    steady = cut(dataclasses.replace(recording, command=command, position=position), "robot", hidden.spec.joints)
+    first = int(np.flatnonzero(recording.command.any(axis=1))[0])
+    time = recording.period * np.arange(-first, 0)[:, None]
+    command, position, velocity = recording.command.copy(), recording.position.copy(), recording.velocity.copy()
+    command[:first], position[:first] = 0.5, position[:first] + np.cumsum(speed(time), axis=0) * recording.period
+    position[first:] += position[first - 1] - recording.position[first - 1] + speed(0.0) * recording.period
+    velocity[:first] += told * speed(time)
+    velocity[first] += told * speed(0.0)
+    return first, dataclasses.replace(recording, command=command, position=position, velocity=velocity)
+
+
+def test_a_motion_may_begin_at_a_steady_speed(hidden):
+    whole = cut(hidden.recording, "robot", hidden.spec.joints)
+    first, recording = moving_before(hidden, lambda time: 0.5 + 0.0 * np.asarray(time), 1.0)
+    steady = cut(recording, "robot", hidden.spec.joints)
+    assert len(steady) == len(whole)
+    assert not steady.left_out
+    np.testing.assert_allclose(steady.velocity[0], 0.5, atol=0.02)
+    np.testing.assert_allclose(steady.start[0], recording.position[first], atol=4e-3)
+    assert steady.start_noise[0] == pytest.approx(2 * whole.start_noise[0], rel=0.2)
+    np.testing.assert_array_equal(steady.velocity[1:], 0.0)
+    np.testing.assert_allclose(steady.noise, whole.noise, rtol=0.1)
+
+
+@pytest.mark.parametrize(
+    ("speed", "told"),
+    [(lambda time: 0.5 - 2.0 * np.asarray(time), 1.0), (lambda time: 0.5 + 0.0 * np.asarray(time), 0.0)],
+    ids=["it slows down", "its velocities do not say so"],
+)
+def test_a_motion_whose_beginning_is_not_known_is_left_out_and_it_is_said(hidden, speed, told):
+    whole = cut(hidden.recording, "robot", hidden.spec.joints)
+    first, recording = moving_before(hidden, speed, told)
+    steady = cut(recording, "robot", hidden.spec.joints)
     assert len(steady) == len(whole) - 1
-    assert steady.left_out == (f"at {first * 0.02:.2f} s: the robot still moves when it begins",)
+    assert steady.left_out == (f"at {first * 0.02:.2f} s: its speed still changes when it begins",)
 
 
 def test_a_motion_ends_where_a_command_is_not_known_and_it_is_said(hidden):
