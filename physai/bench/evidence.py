@@ -21,7 +21,7 @@ from scipy import stats
 from torch import Tensor
 
 from physai.bench.hidden import draw, record, write_table
-from physai.bench.identify import DRIVE, SECONDS, UNKNOWNS
+from physai.bench.identify import DRIVE, SECONDS, UNKNOWNS, WITH_EFFORTS
 from physai.bench.timing import config_of, table
 from physai.envs.simulation import EnvConfig
 from physai.errors import UserError
@@ -35,32 +35,62 @@ from physai.stress.trial import ENOUGH
 from physai.training.evaluation import Evaluation
 from physai.training.run import FINAL_SEED, TrainedPolicy
 
-ARMS = {  # an env, how its policies are trained, and how students
-    "reacher": (("experiment=settle",), ("experiment=settle_student",)),
-    "kuka7_reach": ((), ()),
-}
 ROBOTS, GOALS = 50, 20  # hidden robots, and goals for each of them
 KNOWN, KNOWN_GOALS = 3, 200  # the first of them, which are recorded
 NOMINAL_GOALS = 1000
 AXES = Axis("link_mass", "scale", 0.2, 5.0), Axis("actuator_delay", "set", 0, 5)  # of the stress map
 GRID, CELL = 6, 100
-HIDDEN = (  # drives with rotors, and delays of up to a step more than in randomization=strong
-    *DRIVE,
-    "randomization=strong",
-    "randomization.armature={distribution: uniform, low: 0.005, high: 0.02, operation: add}",
-    *("randomization.actuator_delay.low=2", "randomization.actuator_delay.high=4"),
-)
-STRONG = ("randomization=strong",)
+# The hidden robots have drives, and delays of up to a step more than in randomization=strong.
+HIDDEN = (*DRIVE, "randomization=strong", "randomization.actuator_delay.low=2", "randomization.actuator_delay.high=4")
+STRONG, DRIVES = ("randomization=strong",), "strong, drives"
 WAYS = {
     "default": ("randomization=default",),
     "strong": STRONG,
-    "strong, drives": (*STRONG, *DRIVE),
+    DRIVES: STRONG,
     "curriculum": (
         *("randomization=wide", "curriculum=adr"),
         *("curriculum.results=8", "curriculum.step=0.15", "curriculum.narrow_below=0.8"),  # docs/curriculum.md
     ),
 }
 ADAPTIVE, IDENTIFIED = "adaptive", "identified, drives"
+
+
+@dataclass(frozen=True)
+class Arm:
+    """How policies for an arm are trained, and what is not known of it.
+
+    Attributes:
+        taught: Overrides.
+        learns: Those of students.
+        rotor: What is said of it to who trains with drives, or identifies them; kg m².
+        rotors: What the hidden ones have, at least and at most, kg m².
+        feels: Whether its joints tell their efforts.
+    """
+
+    taught: tuple[str, ...]
+    learns: tuple[str, ...]
+    rotor: float
+    rotors: tuple[float, float]
+    feels: bool
+
+    @property
+    def drives(self) -> tuple[str, ...]:
+        """Overrides of who trains with drives."""
+        return (*DRIVE, f"env.robot.armature={self.rotor}") if self.rotor else DRIVE
+
+    @property
+    def hidden(self) -> tuple[str, ...]:
+        """Overrides that draw hidden robots."""
+        low, high = self.rotors
+        draw = f"{{distribution: uniform, low: {low}, high: {high}, operation: add}}"
+        return (*self.taught, *HIDDEN, f"randomization.armature={draw}")
+
+
+ARMS = {
+    "reacher": Arm(("experiment=settle",), ("experiment=settle_student",), 0.0, (0.005, 0.02), feels=False),
+    # MuJoCo Menagerie gives each joint of this arm a rotor of 0.1 kg m²; and the real one measures torques.
+    "kuka7_reach": Arm((), (), 0.1, (0.05, 0.2), feels=True),
+}
 
 
 class Fleet(RandomizationConfig):
@@ -135,14 +165,14 @@ def measure_evidence(
     """
     found: dict[str, dict[str, list[Shown]]] = {}
     for arm in arms:
-        described = config_of(arm, seed, *ARMS[arm][0], *overrides).env
-        hidden = config_of(arm, seed, *ARMS[arm][0], *HIDDEN, *overrides)
+        described = config_of(arm, seed, *ARMS[arm].taught, *overrides).env
+        hidden = config_of(arm, seed, *ARMS[arm].hidden, *overrides)
         draws, spec = hidden.randomization, RobotSpec.from_config(hidden.env.robot)
         robots = np.concatenate([draw(draws, ParameterLayout(spec), seed + number) for number in range(ROBOTS)])
         recordings = [folder / f"{arm}_robot{number}.csv" for number in range(seed, seed + KNOWN)]
         folder.mkdir(parents=True, exist_ok=True)
         for number, path in enumerate(recordings, seed):
-            seen = record(hidden.env, draws, list(draws.draws), SECONDS, number).recording
+            seen = record(hidden.env, draws, list(draws.draws), SECONDS, number, ARMS[arm].feels).recording
             write_table(seen, spec.joints, str(path))
         found[arm] = {}
         for number in range(seed, seed + seeds):
@@ -165,22 +195,26 @@ def _train_all(
     Robots that cannot be identified, for they never rest, are said.
     """
     common = (f"env={arm}", f"seed={seed}", "export.formats=[]", "evaluation.in_a_row=0", *overrides)
-    taught, learns = ((*common, *each) for each in ARMS[arm])
+    known = ARMS[arm]
+    taught, learns = ((*common, *each) for each in (known.taught, known.learns))
     for way, changes in WAYS.items():
-        yield way, [_train(folder / way.replace(", ", "_"), *taught, *changes)]
+        drives = known.drives if way == DRIVES else ()
+        yield way, [_train(folder / way.replace(", ", "_"), *taught, *changes, *drives)]
     teacher = _train(folder / "teacher", *taught, *STRONG, "policy=privileged")
     yield ADAPTIVE, [_train(folder / "adaptive", *learns, *STRONG, "algo=distill", f"algo.teacher={teacher}")]
     own = []
     for recording in recordings:
         result = recording.with_suffix("") / "identified.yaml"
         if not result.is_file():
-            unknowns = f"fit=[{','.join([*UNKNOWNS, 'armature'])}]"
+            unknowns = f"fit=[{','.join([*(WITH_EFFORTS if known.feels else UNKNOWNS), 'armature'])}]"
             try:
-                _command("identify", f"data={recording}", f"env={arm}", unknowns, *DRIVE, f"output={result.parent}")
+                _command(
+                    "identify", f"data={recording}", f"env={arm}", unknowns, *known.drives, f"output={result.parent}"
+                )
             except UserError as error:
                 print(f"{arm}, {IDENTIFIED}: left out: {error}", flush=True)
                 return
-        own.append(_train(folder / recording.stem, *taught, *DRIVE, f"randomization={result}"))
+        own.append(_train(folder / recording.stem, *taught, *known.drives, f"randomization={result}"))
     yield IDENTIFIED, own
 
 
