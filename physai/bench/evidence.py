@@ -21,7 +21,7 @@ from scipy import stats
 from torch import Tensor
 
 from physai.bench.hidden import draw, record, write_table
-from physai.bench.identify import DRIVE, SECONDS, UNKNOWNS, WITH_EFFORTS
+from physai.bench.identify import DRIVE, SECONDS, UNKNOWNS
 from physai.bench.timing import config_of, table
 from physai.envs.simulation import EnvConfig
 from physai.errors import UserError
@@ -52,7 +52,7 @@ WAYS = {
         *("curriculum.results=8", "curriculum.step=0.15", "curriculum.narrow_below=0.8"),  # docs/curriculum.md
     ),
 }
-ADAPTIVE, IDENTIFIED = "adaptive", "identified, drives"
+ADAPTIVE, IDENTIFIED = "adaptive, drives", "identified, drives"
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,7 @@ class Arm:
 ARMS = {
     "reacher": Arm(("experiment=settle",), ("experiment=settle_student",), 0.0, (0.005, 0.02), feels=False),
     # MuJoCo Menagerie gives each joint of this arm a rotor of 0.1 kg m²; and the real one measures torques.
-    "kuka7_reach": Arm((), (), 0.1, (0.05, 0.2), feels=True),
+    "kuka7_reach": Arm((), ("total_frames=600_000",), 0.1, (0.05, 0.2), feels=True),
 }
 
 
@@ -172,7 +172,9 @@ def measure_evidence(
         recordings = [folder / f"{arm}_robot{number}.csv" for number in range(seed, seed + KNOWN)]
         folder.mkdir(parents=True, exist_ok=True)
         for number, path in enumerate(recordings, seed):
-            seen = record(hidden.env, draws, list(draws.draws), SECONDS, number, ARMS[arm].feels).recording
+            seen = record(
+                hidden.env, draws, list(draws.draws), SECONDS, number, ARMS[arm].feels, bounded=True
+            ).recording
             write_table(seen, spec.joints, str(path))
         found[arm] = {}
         for number in range(seed, seed + seeds):
@@ -200,13 +202,14 @@ def _train_all(
     for way, changes in WAYS.items():
         drives = known.drives if way == DRIVES else ()
         yield way, [_train(folder / way.replace(", ", "_"), *taught, *changes, *drives)]
-    teacher = _train(folder / "teacher", *taught, *STRONG, "policy=privileged")
-    yield ADAPTIVE, [_train(folder / "adaptive", *learns, *STRONG, "algo=distill", f"algo.teacher={teacher}")]
+    among = (*STRONG, *known.drives)
+    teacher = _train(folder / "teacher", *taught, *among, "policy=privileged")
+    yield ADAPTIVE, [_train(folder / "adaptive", *learns, *among, "algo=distill", f"algo.teacher={teacher}")]
     own = []
     for recording in recordings:
         result = recording.with_suffix("") / "identified.yaml"
         if not result.is_file():
-            unknowns = f"fit=[{','.join([*(WITH_EFFORTS if known.feels else UNKNOWNS), 'armature'])}]"
+            unknowns = f"fit=[{','.join([*UNKNOWNS, 'armature'])}]"
             try:
                 _command(
                     "identify", f"data={recording}", f"env={arm}", unknowns, *known.drives, f"output={result.parent}"

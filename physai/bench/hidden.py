@@ -12,6 +12,7 @@ from physai.robots import RobotSpec
 from physai.targets import make
 
 NOISE = 1e-3, 2e-2  # rad, rad/s
+PULL = 1.0  # 1/s, with which motions lead home where they shall stay near it
 
 
 @dataclass(frozen=True)
@@ -57,7 +58,13 @@ def draw(draws: RandomizationConfig, layout: ParameterLayout, seed: int) -> np.n
 
 
 def record(
-    config: EnvConfig, draws: RandomizationConfig, kept: list[str], seconds: float, seed: int, feels: bool = False
+    config: EnvConfig,
+    draws: RandomizationConfig,
+    kept: list[str],
+    seconds: float,
+    seed: int,
+    feels: bool = False,
+    near: bool = False,
 ) -> Hidden:
     """Draw a robot, all as described but for the parameters ``kept`` and its delay; let it jerk and rest in turns.
 
@@ -68,6 +75,8 @@ def record(
         seconds: How long it moves.
         seed: Draws all of it.
         feels: Whether it tells efforts.
+        near: Whether it stays about home, at speeds that policies command: links that fall into their limits at the
+            speed of a data sheet tell little.
     """
     spec = RobotSpec.from_config(config.robot)
     layout = ParameterLayout(spec)
@@ -78,19 +87,22 @@ def record(
         if name not in kept:
             drawn[:, columns] = layout.nominal.double().numpy()[columns]
     steps = round(seconds / config.control_dt)
-    command = jerks(steps, spec.velocity_limit, random)
+    fastest = spec.command_limit if near else spec.velocity_limit
+    command = jerks(steps, fastest, random)
     physics: Physics = make("physics", config.physics, spec, 1, config.control_dt, needs=("reset", "step", "close"))
     physics.reset(np.arange(1), RobotState(spec.home[None], np.zeros((1, len(spec.home)))), layout.dynamics(drawn))
-    measured, effort = np.empty((2, steps, len(spec.home))), np.full((steps, len(spec.home)), np.nan)
+    effort = np.full((steps, len(spec.home)), np.nan)
+    measured = np.array(NOISE)[:, None, None] * random.standard_normal((2, steps, len(spec.home)))
+    measured[0] += drawn[0, layout.columns["encoder_offset"]]
     for step in range(steps):
         state = physics.robot_state()
-        measured[:, step] = state.joint_position[0], state.joint_velocity[0]
+        measured[:, step] += state.joint_position[0], state.joint_velocity[0]
         if feels and state.joint_effort is not None:
             effort[step] = state.joint_effort[0]
+        if near and command[step].any():
+            command[step] = np.clip(command[step] - PULL * (measured[0, step] - spec.home), -fastest, fastest)
         physics.step(command[max(step - delay, 0)][None])
     physics.close()
-    measured[0] += drawn[0, layout.columns["encoder_offset"]]
-    measured += np.array(NOISE)[:, None, None] * random.standard_normal(measured.shape)
     recording = Recording(config.control_dt, measured[0], measured[1], command, effort)
     return Hidden(spec, layout, drawn[0], delay, recording)
 

@@ -44,12 +44,12 @@ def test_every_way_is_judged_on_every_kind_of_robot_and_a_run_that_lies_there_is
     monkeypatch.setattr(evidence, "_command", as_if)
     found = evidence.measure_evidence(0, 1, tmp_path, ("reacher",), TINY)
     assert trained == ["default", "teacher", "adaptive", "reacher_robot0", "reacher_robot1"]
-    assert list(found["reacher"]) == ["default", "adaptive", "identified, drives"]
+    assert list(found["reacher"]) == ["default", "adaptive, drives", "identified, drives"]
     for shown in (each for ways in found["reacher"].values() for each in ways):
         assert [len(judged.settled) for judged in shown.on.values()] == [1, 3, 2]
         assert all(0 <= rate <= 1 for judged in shown.on.values() for rate in (*judged.success, *judged.settled))
         assert 0 <= shown.works <= 1
-    adaptive, own = (found["reacher"][way][0].on for way in ("adaptive", "identified, drives"))
+    adaptive, own = (found["reacher"][way][0].on for way in ("adaptive, drives", "identified, drives"))
     assert adaptive == own  # one policy on the same robots, with the same goals
     assert json.loads((tmp_path / "evidence.json").read_text())["reacher"]["default"][0]["works"] == (
         found["reacher"]["default"][0].works
@@ -61,7 +61,12 @@ def test_every_way_is_judged_on_every_kind_of_robot_and_a_run_that_lies_there_is
     console = Console(width=180, record=True)
     console.print(evidence.evidence_table(found))
     shown = console.export_text()
-    for part in ("reacher, the robot as described", "reacher, 3 hidden robots", "adaptive", "identified, drives"):
+    for part in (
+        "reacher, the robot as described",
+        "reacher, 3 hidden robots",
+        "adaptive, drives",
+        "identified, drives",
+    ):
         assert part in shown
 
 
