@@ -172,9 +172,7 @@ def measure_evidence(
         recordings = [folder / f"{arm}_robot{number}.csv" for number in range(seed, seed + KNOWN)]
         folder.mkdir(parents=True, exist_ok=True)
         for number, path in enumerate(recordings, seed):
-            seen = record(
-                hidden.env, draws, list(draws.draws), SECONDS, number, ARMS[arm].feels, bounded=True
-            ).recording
+            seen = record(hidden.env, draws, list(draws.draws), SECONDS, number, ARMS[arm].feels, near=True).recording
             write_table(seen, spec.joints, str(path))
         found[arm] = {}
         for number in range(seed, seed + seeds):
