@@ -62,9 +62,10 @@ class Arm:
     Attributes:
         taught: Overrides.
         learns: Those of students.
-        rotor: What is said of it to who trains with drives, or identifies them; kg m².
+        rotor: What training with drives, and identification, take its rotors for; kg m².
         rotors: What the hidden ones have, at least and at most, kg m².
-        feels: Whether its joints tell their efforts.
+        feels: Whether its joints tell their efforts. It then need not bring motors to their limits to be known, and
+            stays near home.
     """
 
     taught: tuple[str, ...]
@@ -75,15 +76,16 @@ class Arm:
 
     @property
     def drives(self) -> tuple[str, ...]:
-        """Overrides of who trains with drives."""
+        """Overrides for training with drives, and for identification."""
         return (*DRIVE, f"env.robot.armature={self.rotor}") if self.rotor else DRIVE
 
     @property
     def hidden(self) -> tuple[str, ...]:
-        """Overrides that draw hidden robots."""
+        """Overrides that draw hidden robots; one of which nothing is drawn has rotors from the middle of the range."""
         low, high = self.rotors
-        draw = f"{{distribution: uniform, low: {low}, high: {high}, operation: add}}"
-        return (*self.taught, *HIDDEN, f"randomization.armature={draw}")
+        drawn = f"{{distribution: uniform, low: {low}, high: {high}, operation: set}}"
+        middle = f"env.robot.armature={(low + high) / 2}"
+        return (*self.taught, *HIDDEN, middle, f"randomization.armature={drawn}")
 
 
 ARMS = {
@@ -172,8 +174,13 @@ def measure_evidence(
         recordings = [folder / f"{arm}_robot{number}.csv" for number in range(seed, seed + KNOWN)]
         folder.mkdir(parents=True, exist_ok=True)
         for number, path in enumerate(recordings, seed):
-            seen = record(hidden.env, draws, list(draws.draws), SECONDS, number, ARMS[arm].feels, near=True).recording
-            write_table(seen, spec.joints, str(path))
+            feels = ARMS[arm].feels
+            seen = record(hidden.env, draws, list(draws.draws), SECONDS, number, feels, near=feels).recording
+            fresh = path.with_suffix(".new")
+            write_table(seen, spec.joints, str(fresh))
+            if path.is_file() and path.read_bytes() != fresh.read_bytes():
+                shutil.rmtree(path.with_suffix(""), ignore_errors=True)  # found in another recording
+            fresh.replace(path)
         found[arm] = {}
         for number in range(seed, seed + seeds):
             at, maps = folder / f"{arm}_seed{number}", {}
@@ -192,7 +199,7 @@ def _train_all(
 ) -> Iterator[tuple[str, list[Path]]]:
     """Train in each way, and say where the policies lie: one, or one for each robot that was recorded.
 
-    Robots that cannot be identified, for they never rest, are said.
+    Where a robot cannot be identified, a line says why, and the way is left out.
     """
     common = (f"env={arm}", f"seed={seed}", "export.formats=[]", "evaluation.in_a_row=0", *overrides)
     known = ARMS[arm]
@@ -207,6 +214,7 @@ def _train_all(
     for recording in recordings:
         result = recording.with_suffix("") / "identified.yaml"
         if not result.is_file():
+            shutil.rmtree(folder / recording.stem, ignore_errors=True)  # trained with another result
             unknowns = f"fit=[{','.join([*UNKNOWNS, 'armature'])}]"
             try:
                 _command(

@@ -75,8 +75,8 @@ def record(
         seconds: How long it moves.
         seed: Draws all of it.
         feels: Whether it tells efforts.
-        near: Whether it stays about home, at speeds that policies command: links that fall into their limits at the
-            speed of a data sheet tell little.
+        near: Whether commands stay within those of policies, and lead back towards home while the robot moves. At the
+            speeds of a data sheet links hit their limits, and such motions tell little.
     """
     spec = RobotSpec.from_config(config.robot)
     layout = ParameterLayout(spec)
@@ -108,7 +108,7 @@ def record(
 
 
 def jerks(steps: int, fastest: np.ndarray, random: np.random.Generator) -> np.ndarray:
-    """Velocity commands [steps, n] that saturate motors, with rests of 0.6 s at 50 Hz between motions."""
+    """Velocity commands [steps, n] up to ``fastest``, with rests of 0.6 s at 50 Hz between motions."""
     command = np.zeros((steps, len(fastest)))
     step = 30
     while step < steps - 100:

@@ -164,8 +164,9 @@ def fit(predict: Predictor, trials: Trials, unknowns: Unknowns, longest: int, se
     delays = range(round(longest * predict.per_control_step) + 1)
     starts = np.zeros((_STARTS, len(unknowns) + trials.start.size))
     # From the robot as described; and with motors that can do no more than they did, for that may be all they can.
-    starts[1:, : len(unknowns)] = shown = problem.as_strong_as_shown()
-    certain, random = 1 if np.allclose(shown, 0.0) else 2, np.random.default_rng(seed)
+    shown, random = problem.as_strong_as_shown(), np.random.default_rng(seed)
+    starts[1:, : len(shown)] = shown
+    certain = 1 if np.allclose(shown, 0.0) else 2  # where no effort was recorded, the two are one
     starts[certain:, : len(shown)] += 0.7 * random.standard_normal((_STARTS - certain, len(shown)))
     found: list[tuple[OptimizeResult, float]] = []
     for number, start in enumerate(starts, 1):

@@ -10,12 +10,12 @@ from physai.errors import UserError
 from physai.identify.recording import Recording
 
 _STILL = 0.5  # s with one command, after which a robot has come to rest, or to a steady speed
-_MEAN = 0.24  # s of this, whose mean is where a motion begins
+_MEAN = 0.24  # s of this, from which it comes where a motion begins
 _LONGEST = 4.0  # s; farther ahead, small errors grow and say little of parameters
 _SHORTEST = 0.2  # s
 _CREEPS = 4.0  # standard deviations of what noise does to a mean; and at least, rad and rad/s:
 _RESTING = np.array([2e-4, 2e-3])
-_STEADY = 0.1  # of a speed, by which it may change in this time: an arm that sinks is never quite steady
+_STEADY = 0.1  # of a speed, by which it may change from half to half: an arm that sinks is never quite steady
 _FEWEST, _MOST = 2, 40  # motions: one to learn from, one to judge by; and more hardly tell more
 _LEAST_NOISE = np.array([1e-5, 1e-4])  # rad, rad/s; encoders resolve no more
 _LEAST_SHARE = 0.01  # of the largest effort, to which it is known: sensors of torque have errors of scale, too
@@ -113,9 +113,9 @@ class _Motion:
 class _Begin:
     position: np.ndarray  # rad, [n]
     velocity: np.ndarray  # rad/s, [n]
-    spread: float  # standard deviation of the position, in those of the sensor
-    squares: np.ndarray  # of what noise left of positions and velocities, a mean over the joints, [2]
-    degrees: int  # of freedom of these, for each joint
+    spread: float  # standard deviation of the position, as a multiple of the sensor's
+    squares: np.ndarray  # sums of squared residuals of positions and velocities, means over the joints, [2]
+    degrees: np.ndarray  # of freedom of these, [2]
 
 
 def _motions(recording: Recording) -> tuple[list[_Motion], list[str]]:
@@ -142,18 +142,20 @@ def _motions(recording: Recording) -> tuple[list[_Motion], list[str]]:
             left_out.append(f"{at}: too short")
         elif known_at.sum() < max(mean // 2, 4):
             left_out.append(f"{at}: too little was measured before it")
-        elif (begin := _begin(measured[:, known_at], recording.period * (np.flatnonzero(known_at) - mean + 1))) is None:
-            left_out.append(f"{at}: its speed still changes when it begins")
         else:
-            motions.append(_Motion(first, last, begin))
+            begin = _begin(measured[:, known_at], recording.period * (np.flatnonzero(known_at) - mean + 1))
+            if isinstance(begin, str):
+                left_out.append(f"{at}: {begin}")
+            else:
+                motions.append(_Motion(first, last, begin))
     return motions, left_out
 
 
-def _begin(measured: np.ndarray, time: np.ndarray) -> _Begin | None:
-    """Say how a motion begins at time 0, or None if that is not known.
+def _begin(measured: np.ndarray, time: np.ndarray) -> _Begin | str:
+    """Say how a motion begins at time 0, or why that is not known.
 
-    The two halves of a robot that rests differ by no more than noise makes them. Those of one with a steady speed
-    differ by the way that it makes at this speed.
+    The two halves of what was measured of a robot that rests differ by no more than noise makes them. Those of one with
+    a steady speed differ by the way that it makes at this speed, and its speed hardly changes.
 
     Args:
         measured: What was measured before, [2, k, n].
@@ -163,19 +165,39 @@ def _begin(measured: np.ndarray, time: np.ndarray) -> _Begin | None:
     first, second = measured[:, :half], measured[:, half : 2 * half]
     noise = np.sqrt((first.var(axis=1, ddof=1) + second.var(axis=1, ddof=1)) / half)  # of the difference of means
     change, speed = second.mean(axis=1) - first.mean(axis=1), measured[1].mean(axis=0)
-    noise = np.maximum(_CREEPS * noise, _RESTING[:, None])
-    if (np.abs(change[0]) <= noise[0]).all() and (np.abs(speed) <= noise[1]).all():
+    tolerance = np.maximum(_CREEPS * noise, _RESTING[:, None])
+    if (np.abs(change[0]) <= tolerance[0]).all() and (np.abs(speed) <= tolerance[1]).all():
         squares = np.square(measured - measured.mean(axis=1, keepdims=True)).sum(axis=1).mean(axis=1)
-        return _Begin(measured[0].mean(axis=0), np.zeros_like(speed), count**-0.5, squares, count - 1)
-    way = time[half : 2 * half].mean() - time[:half].mean()
-    noise += _STEADY * np.abs(speed) * np.array([[way], [1.0]])
-    if (np.abs(change - [way * speed, np.zeros_like(speed)]) > noise).any():
-        return None
-    lines = np.stack([np.ones(count), time], axis=1)
-    solve = np.linalg.pinv(lines)
-    (position, velocity), spread = solve @ measured[0], float(np.linalg.norm(solve[0]))
-    left = np.stack([values - lines @ (solve @ values) for values in measured])
-    return _Begin(position, velocity, spread, np.square(left).sum(axis=1).mean(axis=1), count - 2)
+        position, degrees = measured[0].mean(axis=0), np.full(2, count - 1.0)
+        return _Begin(position, np.zeros_like(speed), count**-0.5, squares, degrees)
+    between = time[half : 2 * half].mean() - time[:half].mean()
+    tolerance += _STEADY * np.abs(speed) * np.array([[between], [1.0]])
+    if (np.abs(change[1]) > tolerance[1]).any():
+        return "its speed still changes when it begins"
+    if (np.abs(change[0] - between * speed) > tolerance[0]).any():
+        return "positions and velocities that were measured before it do not belong to each other"
+    return _at_speed(measured, time)
+
+
+def _at_speed(measured: np.ndarray, time: np.ndarray) -> _Begin:
+    """Fit a position, a velocity and an acceleration to positions and velocities, weighted by their noise."""
+    ones, zeros = np.ones_like(time), np.zeros_like(time)
+    ways = np.stack([[ones, time, time**2 / 2], [zeros, ones, time]]).transpose(0, 2, 1)  # [2, k, 3]
+    alone = [_residuals(ways[0], measured[0]), _residuals(ways[1][:, 1:], measured[1])]
+    noise = [np.sqrt(np.square(left).sum() / left[0].size / (len(time) - 3 + at)) for at, left in enumerate(alone)]
+    weight = 1.0 / np.maximum(noise, _LEAST_NOISE)
+    rows = np.concatenate(weight[:, None, None] * ways)
+    solve = np.linalg.pinv(rows)
+    position, velocity, _ = found = solve @ np.concatenate(weight[:, None, None] * measured)
+    squares = np.square(measured - ways @ found).sum(axis=1).mean(axis=1)
+    taken = np.einsum("ij,ji->i", rows, solve).reshape(2, -1).sum(axis=1)  # degrees that the fit has taken
+    spread = float(np.linalg.norm(solve[0]) * weight[0])
+    return _Begin(position, velocity, spread, squares, len(time) - taken)
+
+
+def _residuals(ways: np.ndarray, values: np.ndarray) -> np.ndarray:
+    left: np.ndarray = values - ways @ (np.linalg.pinv(ways) @ values)
+    return left
 
 
 def _measured(recording: Recording) -> np.ndarray:

@@ -44,9 +44,9 @@ class MuJoCoPhysics:
     - ``impulse`` is PyBullet's motor and integration (:mod:`physai.physics.impulse`), so robots move as in
       :class:`physai.physics.pybullet.PyBulletPhysics`, friction included.
     - ``servo`` is how a drive behaves: an effort in proportion to the missing velocity closes in on it with a time
-      constant, whatever the pose; the weight of the robot as described is carried, whatever the velocity, as arms in
-      space do, but nothing that a robot has more or less of; dry friction resists; limits of joints are as soft as
-      MuJoCo has them. It takes as many steps a period as the time constant asks for.
+      constant, whatever the pose; the weight of the robot as described is carried at any velocity, as controllers of
+      real arms do it, but no payload, nor what links weigh more or less than described; dry friction resists; limits
+      of joints are as soft as MuJoCo has them. It takes as many steps a period as the time constant asks for.
 
     Args:
         spec: The robot.
@@ -220,25 +220,22 @@ class _Servo:
 
     def __init__(self, batch: Batch, substeps: int, control_dt: float, time_constant: float) -> None:
         self._batch, self._substeps, self._dt, self._fastest = batch, substeps, control_dt, time_constant
-        self._friction, self._effort = batch.expand("dof_frictionloss"), batch.expand("actuator_forcerange")
+        self._friction, self._effort = batch.expand("dof_frictionloss"), batch.expand("jnt_actfrcrange")
         self._gain, self._bias = batch.expand("actuator_gainprm"), batch.expand("actuator_biasprm")
         self._mass = batch.bind("M")
         self._own = batch.model.M_rowadr + batch.model.M_rownnz - 1  # the diagonal of the mass matrix
         self._time_constant = np.zeros(batch.bind("qpos").shape)
         self._given, self._resisted = batch.bind("qfrc_actuator"), batch.bind("qfrc_constraint")
-        self._carrying, self._strongest = batch.bind("qfrc_gravcomp"), np.zeros(self._time_constant.shape)
         self.effort = np.zeros(self._time_constant.shape)
 
     def set(self, rows: np.ndarray, parameters: DynamicsParameters) -> None:
-        self._friction[rows], self._strongest[rows] = parameters["joint_friction"], parameters["effort_limit"]
+        self._friction[rows] = parameters["joint_friction"]
+        self._effort[rows, :, 0], self._effort[rows, :, 1] = -parameters["effort_limit"], parameters["effort_limit"]
         gain = np.clip(parameters["velocity_gain"], 1e-6, 1.0)
         self._time_constant[rows] = self._fastest + self._dt * (1.0 - gain) / gain
 
     def step(self, command: np.ndarray) -> None:
-        self._batch.forward(stage=int(mujoco.mjtStage.mjSTAGE_VEL))
-        # One effort carries the weight and drives; MuJoCo limits what drives.
-        self._effort[:, :, 0] = -self._strongest - self._carrying
-        self._effort[:, :, 1] = self._strongest - self._carrying
+        self._batch.forward(stage=int(mujoco.mjtStage.mjSTAGE_POS))
         gain = self._mass[:, self._own] / self._time_constant
         self._gain[:, :, 0], self._bias[:, :, 2] = gain, -gain
         self._batch.ctrl = command
@@ -274,16 +271,16 @@ def _make_model(spec: RobotSpec, motor: str, time_step: float) -> "mujoco.MjMode
         shapes = [(sphere.body, sphere.center, sphere.radius) for sphere in spheres]
         made = mujoco.MjSpec.from_string(engine_urdf(spec.bodies, spec.joints, shapes).decode())
         made.compiler.fusestatic = False  # a link keeps its mass to itself
+        drives, springs = motor == "servo" and spec.servo is None, spec.servo is not None
         for joint in made.joints:
-            joint.actfrclimited = False  # the effort limit is the motor's, each robot's own
-            if motor == "servo" or spec.servo is not None:
+            # The effort limit is the motor's, each robot's own; what carries the weight counts, too.
+            joint.actfrclimited, joint.actfrcrange, joint.actgravcomp = drives, [-1.0, 1.0], drives
+            if drives or springs:
                 actuator = made.add_actuator(name=joint.name, target=joint.name)
                 actuator.trntype, actuator.biastype = mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtBias.mjBIAS_AFFINE
-                actuator.forcelimited, actuator.forcerange = True, [-1.0, 1.0]
-                joint.actgravcomp = spec.servo is None
-        if motor == "servo" and spec.servo is None:
-            for body in made.bodies:
-                body.gravcomp = 1.0
+                actuator.forcelimited, actuator.forcerange = springs, [-1.0, 1.0]
+        for body in made.bodies:
+            body.gravcomp = 1.0 if drives else 0.0
         if spec.floating is not None:
             put_on_floor(made, spec.floating, spec.base)
         model = made.compile()

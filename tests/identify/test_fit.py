@@ -84,10 +84,10 @@ def test_the_rotor_of_a_drive_is_found_where_nothing_moves_as_it_does(env_config
 def test_an_arm_that_sinks_under_its_load_is_found_near_home_from_motions_that_begin_while_it_does(env_config):
     """No other arm of these tests sinks, and no other recording tells of it at the speeds that policies command."""
     config = env_config("kuka_reacher", "physics=mujoco", "physics.motor=servo", "env.robot.home=[0.0,0.7]")
-    hidden = record(config, randomization("wide"), ["payload", "velocity_gain"], 10.0, 3, feels=True, near=True)
+    hidden = record(config, randomization("wide"), ["payload", "velocity_gain"], 10.0, 10, feels=True, near=True)
     assert (np.abs(hidden.recording.command) <= hidden.spec.command_limit).all()
     assert (np.abs(hidden.recording.position - hidden.spec.home) < 0.7).all()
-    assert cut(hidden.recording, "robot", hidden.spec.joints).velocity.any()
+    assert np.abs(cut(hidden.recording, "robot", hidden.spec.joints).velocity).max() > 0.1
     result = found(hidden, config, ["payload", "velocity_gain"], longest=3)
     assert result.explained
     assert result.delay == hidden.delay

@@ -153,7 +153,7 @@ def test_the_xarm_s_own_inertias_are_refused():
 @pytest.mark.parametrize("env", ["panda_reach", "kuka7_reach", "xarm_reach"])
 def test_arms_stand_still_without_a_command(env):
     spec = RobotSpec.from_config(config(env))
-    for engine in ("pybullet", "impulse"):  # a servo without an integral part sags
+    for engine in ENGINES:
         physics = ENGINES[engine](spec, 1, 0.02)
         for _ in range(50):
             state = physics.step(np.zeros((1, len(spec.joints))))
