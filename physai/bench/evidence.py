@@ -61,6 +61,7 @@ class Arm:
 
     Attributes:
         taught: Overrides.
+        teaches: Those of teachers, besides.
         learns: Those of students.
         rotor: What training with drives, and identification, take its rotors for; kg m².
         rotors: What the hidden ones have, at least and at most, kg m².
@@ -69,6 +70,7 @@ class Arm:
     """
 
     taught: tuple[str, ...]
+    teaches: tuple[str, ...]
     learns: tuple[str, ...]
     rotor: float
     rotors: tuple[float, float]
@@ -89,9 +91,20 @@ class Arm:
 
 
 ARMS = {
-    "reacher": Arm(("experiment=settle",), ("experiment=settle_student",), 0.0, (0.005, 0.02), feels=False),
-    # MuJoCo Menagerie gives each joint of this arm a rotor of 0.1 kg m²; and the real one measures torques.
-    "kuka7_reach": Arm((), ("total_frames=600_000",), 0.1, (0.05, 0.2), feels=True),
+    "reacher": Arm(("experiment=settle",), (), ("experiment=settle_student",), 0.0, (0.005, 0.02), feels=False),
+    # MuJoCo Menagerie gives each joint of this arm a rotor of 0.1 kg m²; and the real one measures torques. A teacher
+    # that is told 50 parameters needs many robots in a batch: of few it learns which are which.
+    "kuka7_reach": Arm(
+        (),
+        (
+            *("collector=single", "collector.num_envs=512", "collector.frames_per_batch=8192"),
+            *("algo.minibatch_size=1024", "total_frames=1_200_000"),
+        ),
+        ("total_frames=600_000",),
+        0.1,
+        (0.05, 0.2),
+        feels=True,
+    ),
 }
 
 
@@ -208,7 +221,7 @@ def _train_all(
         drives = known.drives if way == DRIVES else ()
         yield way, [_train(folder / way.replace(", ", "_"), *taught, *changes, *drives)]
     among = (*STRONG, *known.drives)
-    teacher = _train(folder / "teacher", *taught, *among, "policy=privileged")
+    teacher = _train(folder / "teacher", *taught, *known.teaches, *among, "policy=privileged")
     yield ADAPTIVE, [_train(folder / "adaptive", *learns, *among, "algo=distill", f"algo.teacher={teacher}")]
     own = []
     for recording in recordings:
