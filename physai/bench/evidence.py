@@ -93,7 +93,7 @@ class Arm:
 ARMS = {
     "reacher": Arm(("experiment=settle",), (), ("experiment=settle_student",), 0.0, (0.005, 0.02), feels=False),
     # MuJoCo Menagerie gives each joint of this arm a rotor of 0.1 kg m²; and the real one measures torques. A teacher
-    # that is told 50 parameters needs many robots in a batch: of few it learns which are which.
+    # that is told 50 parameters moves too far in each small batch.
     "kuka7_reach": Arm(
         (),
         (
