@@ -53,6 +53,7 @@ WAYS = {
     ),
 }
 ADAPTIVE, IDENTIFIED = "adaptive, drives", "identified, drives"
+DONE = "summary.json"  # which a run writes last
 
 
 @dataclass(frozen=True)
@@ -222,12 +223,12 @@ def _train_all(
         yield way, [_train(folder / way.replace(", ", "_"), *taught, *changes, *drives)]
     among = (*STRONG, *known.drives)
     teacher = _train(folder / "teacher", *taught, *known.teaches, *among, "policy=privileged")
-    yield ADAPTIVE, [_train(folder / "adaptive", *learns, *among, "algo=distill", f"algo.teacher={teacher}")]
+    taught_by = "algo=distill", f"algo.teacher={teacher}"
+    yield ADAPTIVE, [_train(folder / "adaptive", *learns, *among, *taught_by, after=teacher / DONE)]
     own = []
     for recording in recordings:
         result = recording.with_suffix("") / "identified.yaml"
         if not result.is_file():
-            shutil.rmtree(folder / recording.stem, ignore_errors=True)  # trained with another result
             unknowns = f"fit=[{','.join([*UNKNOWNS, 'armature'])}]"
             try:
                 _command(
@@ -236,14 +237,16 @@ def _train_all(
             except UserError as error:
                 print(f"{arm}, {IDENTIFIED}: left out: {error}", flush=True)
                 return
-        own.append(_train(folder / recording.stem, *taught, *known.drives, f"randomization={result}"))
+        with_it = *taught, *known.drives, f"randomization={result}"
+        own.append(_train(folder / recording.stem, *with_it, after=result))
     yield IDENTIFIED, own
 
 
-def _train(folder: Path, *overrides: str) -> Path:
-    said = folder / ".hydra" / "overrides.yaml"
-    same = said.is_file() and OmegaConf.load(said) == list(overrides)
-    if not (same and (folder / "summary.json").is_file()):  # which a run writes last
+def _train(folder: Path, *overrides: str, after: Path | None = None) -> Path:
+    """Train, unless it was done with these overrides, and after what a run depends on was written."""
+    said, done = folder / ".hydra" / "overrides.yaml", folder / DONE
+    same = said.is_file() and OmegaConf.load(said) == list(overrides) and done.is_file()
+    if not same or (after is not None and done.stat().st_mtime < after.stat().st_mtime):
         shutil.rmtree(folder, ignore_errors=True)
         _command("train", *overrides, f"hydra.run.dir={folder}")
     return folder
