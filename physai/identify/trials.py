@@ -16,6 +16,7 @@ _SHORTEST = 0.2  # s
 _CREEPS = 4.0  # standard deviations of what noise does to a mean; and at least, rad and rad/s:
 _RESTING = np.array([2e-4, 2e-3])
 _STEADY = 0.1  # of a speed, by which it may change from half to half: an arm that sinks is never quite steady
+_SHOWS = 3.0  # standard deviations, from which an acceleration does
 _FEWEST, _MOST = 2, 40  # motions: one to learn from, one to judge by; and more hardly tell more
 _LEAST_NOISE = np.array([1e-5, 1e-4])  # rad, rad/s; encoders resolve no more
 _LEAST_SHARE = 0.01  # of the largest effort, to which it is known: sensors of torque have errors of scale, too
@@ -180,19 +181,22 @@ def _begin(measured: np.ndarray, time: np.ndarray) -> _Begin | str:
 
 
 def _at_speed(measured: np.ndarray, time: np.ndarray) -> _Begin:
-    """Fit a position, a velocity and an acceleration to positions and velocities, weighted by their noise."""
+    """Fit positions and velocities, weighted by their noise: position, velocity, and acceleration where that shows."""
     ones, zeros = np.ones_like(time), np.zeros_like(time)
     ways = np.stack([[ones, time, time**2 / 2], [zeros, ones, time]]).transpose(0, 2, 1)  # [2, k, 3]
     alone = [_residuals(ways[0], measured[0]), _residuals(ways[1][:, 1:], measured[1])]
     noise = [np.sqrt(np.square(left).sum() / left[0].size / (len(time) - 3 + at)) for at, left in enumerate(alone)]
     weight = 1.0 / np.maximum(noise, _LEAST_NOISE)
-    rows = np.concatenate(weight[:, None, None] * ways)
+    rows, values = (np.concatenate(weight[:, None, None] * each) for each in (ways, measured))
     solve = np.linalg.pinv(rows)
-    position, velocity, _ = found = solve @ np.concatenate(weight[:, None, None] * measured)
+    if (np.abs(solve[2] @ values) < _SHOWS * np.linalg.norm(solve[2])).all():
+        ways, rows = ways[:, :, :2], rows[:, :2]
+        solve = np.linalg.pinv(rows)
+    found = solve @ values
     squares = np.square(measured - ways @ found).sum(axis=1).mean(axis=1)
     taken = np.einsum("ij,ji->i", rows, solve).reshape(2, -1).sum(axis=1)  # degrees that the fit has taken
     spread = float(np.linalg.norm(solve[0]) * weight[0])
-    return _Begin(position, velocity, spread, squares, len(time) - taken)
+    return _Begin(found[0], found[1], spread, squares, len(time) - taken)
 
 
 def _residuals(ways: np.ndarray, values: np.ndarray) -> np.ndarray:
