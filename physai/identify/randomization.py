@@ -9,6 +9,7 @@ from physai.physics import ParameterLayout, RandomizationConfig
 from physai.physics.randomization import Draw, LogUniform, Normal, Uniform
 
 FLOOR = 0.05  # units; half of the narrowest range: 5 % of a mass, 15 g, 1 mrad (see docs/identify.md)
+_OF_EFFORT, _MOST = ("joint_friction", "armature"), 0.25  # whose units follow the effort: at most so much of the value
 _SENSORS = 0.2  # share by which the noise that was measured may be more or less
 
 
@@ -69,9 +70,17 @@ def text(randomization: RandomizationConfig, layout: ParameterLayout, about: Seq
 def _ends(found: Fit) -> tuple[np.ndarray, np.ndarray]:
     """Ends of the ranges, SI units, [F] each."""
     spread = np.where(found.told, SPREAD * found.deviation, SPREAD * found.alone)
-    ends = found.coordinates + np.maximum(spread, FLOOR) * np.array([[-1.0], [1.0]])
-    low, high = found.unknowns.values(np.clip(ends, found.unknowns.low, found.unknowns.high))
-    return low, high
+    (low, high), (least_low, least_high) = (
+        found.unknowns.values(
+            np.clip(found.coordinates + np.array([[-1.0], [1.0]]) * by, found.unknowns.low, found.unknowns.high)
+        )
+        for by in (spread, np.full_like(spread, FLOOR))
+    )
+    # Data sheets give wrists the efforts of shoulders: a width in parts of these may be more than all that was found.
+    narrow = [label.startswith(_OF_EFFORT) for label in found.unknowns.labels]
+    least_low = np.where(narrow, np.maximum(least_low, (1.0 - _MOST) * found.values), least_low)
+    least_high = np.where(narrow, np.minimum(least_high, (1.0 + _MOST) * found.values), least_high)
+    return np.minimum(low, least_low), np.maximum(high, least_high)
 
 
 def _of_base(draw: Draw | None, nominal: np.ndarray) -> np.ndarray:

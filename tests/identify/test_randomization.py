@@ -56,6 +56,13 @@ def test_what_is_told_is_drawn_from_its_interval_and_never_from_less_than_the_fl
     np.testing.assert_allclose([mass.low[1], mass.high[1]], 2.0 * np.exp([-SPREAD * 0.1, SPREAD * 0.1]), rtol=1e-4)
 
 
+def test_a_friction_that_is_small_beside_the_effort_is_not_drawn_far_from_what_was_found(found, layout, base):
+    found.coordinates[4], found.deviation[4], found.alone[4] = -0.1, 1e-6, 1e-6
+    friction, value = identified(found, layout, base).joint_friction, found.values[4]
+    assert 0.0 < value < 0.03
+    assert [friction.low[0], friction.high[0]] == pytest.approx([0.75 * value, 1.25 * value], rel=1e-4)
+
+
 def test_parameters_that_only_show_together_are_drawn_close_to_what_was_found(found, layout, base):
     draws = identified(found, layout, base)
     assert draws.link_mass.high[2] < 1.06
