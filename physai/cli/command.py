@@ -232,7 +232,7 @@ def _combinations(given: list[str]) -> Iterable[list[str]]:
 def _begin(config: DictConfig) -> Path:
     """Make this process ready for a job; return the folder of its run."""
     for library in ("OMP", "MKL", "OPENBLAS"):  # for what this process, or one of the job's, loads from here on
-        os.environ[f"{library}_NUM_THREADS"] = str(config.get("threads", 1))
+        os.environ[f"{library}_NUM_THREADS"] = str(config.get("threads") or 1)
     folder = Path(HydraConfig.get().runtime.output_dir)
     return folder.relative_to(Path.cwd()) if folder.is_relative_to(Path.cwd()) else folder
 

@@ -1,6 +1,7 @@
 """The command: a table, a file, and one line for what is wrong."""
 
 import json
+import os
 
 import numpy as np
 import pytest
@@ -30,6 +31,7 @@ def table(hidden, tmp_path, monkeypatch):
 def test_it_shows_and_writes_what_was_found(run, table, hidden):
     code, output, error = run("identify", "data=robot.csv", "fit=[velocity_gain,joint_damping]", "delays=2")
     assert code == 0, error
+    assert os.environ["OMP_NUM_THREADS"] == "1"  # with as many threads of MuJoCo as there are cores
     assert "95 % interval" in output
     assert "the noise of the sensors explains them" in output
     folder = table.with_name("robot_identified")
