@@ -172,7 +172,8 @@ def _begin(measured: np.ndarray, time: np.ndarray) -> _Begin | str:
         position, degrees = measured[0].mean(axis=0), np.full(2, count - 1.0)
         return _Begin(position, np.zeros_like(speed), count**-0.5, squares, degrees)
     between = time[half : 2 * half].mean() - time[:half].mean()
-    tolerance += _STEADY * np.abs(speed) * np.array([[between], [1.0]])
+    noise[0] = np.hypot(noise[0], 0.5 * between * noise[1])  # of a way less that of the mean velocity
+    tolerance = np.maximum(_CREEPS * noise, _RESTING[:, None]) + _STEADY * np.abs(speed) * np.array([[between], [1.0]])
     if (np.abs(change[1]) > tolerance[1]).any():
         return "its speed still changes when it begins"
     if (np.abs(change[0] - between * speed) > tolerance[0]).any():
