@@ -83,6 +83,11 @@ class Arm:
         return (*DRIVE, f"env.robot.armature={self.rotor}") if self.rotor else DRIVE
 
     @property
+    def unknowns(self) -> list[str]:
+        """What is looked for in a recording; without weight or efforts, nothing tells where an encoder has its zero."""
+        return [*UNKNOWNS, "armature", *(["encoder_offset"] if self.feels else [])]
+
+    @property
     def hidden(self) -> tuple[str, ...]:
         """Overrides that draw hidden robots; one of which nothing is drawn has rotors from the middle of the range."""
         low, high = self.rotors
@@ -229,11 +234,9 @@ def _train_all(
     for recording in recordings:
         result = recording.with_suffix("") / "identified.yaml"
         if not result.is_file():
-            unknowns = f"fit=[{','.join([*UNKNOWNS, 'armature'])}]"
+            told = f"data={recording}", f"env={arm}", f"fit=[{','.join(known.unknowns)}]", *known.drives
             try:
-                _command(
-                    "identify", f"data={recording}", f"env={arm}", unknowns, *known.drives, f"output={result.parent}"
-                )
+                _command("identify", *told, f"output={result.parent}")
             except UserError as error:
                 print(f"{arm}, {IDENTIFIED}: left out: {error}", flush=True)
                 return

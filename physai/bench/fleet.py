@@ -30,9 +30,9 @@ from physai.bench.timing import cpu_seconds, table
 from physai.deploy import Metadata, State, read_metadata
 from physai.errors import UserError
 from physai.ros.driving.fleet_client import Arm, FleetClient
-from physai.ros.driving.fleet_nodes import fleet_nodes
-from physai.ros.driving.forked import ForkedNode
+from physai.ros.driving.forked import ForkedProcess
 from physai.ros.driving.processes import NodeProcess
+from physai.ros.fleet_nodes import fleet_nodes
 from physai.ros.topics import joint_states, qos
 from physai.ros.topics.commands import controller_topic
 from physai.ros.topics.emergency_stop import ALL
@@ -74,37 +74,50 @@ class _Heard:
     still: list[bool] = field(default_factory=list)
     sent: list[int] = field(default_factory=list)
 
-    def take(self, message: Float64MultiArray, info: dict[str, int]) -> None:
-        self.arrived.append(info["received_timestamp"])
-        self.still.append(not any(message.data))
+    @property
+    def stands(self) -> bool:
+        """Whether the last command does not move it, or none has come."""
+        return not self.still or self.still[-1]
 
-    def take_source(self, _: Float64MultiArray, info: dict[str, int]) -> None:
-        self.sent.append(info["source_timestamp"])
+    def take(self, at_robot: Subscription, by_driver: Subscription) -> None:
+        """Take what has come since the last time."""
+        for message, info in waiting(at_robot):
+            self.arrived.append(info["received_timestamp"])
+            self.still.append(not any(message.data))
+        self.sent += [info["source_timestamp"] for _, info in waiting(by_driver)]
 
 
 class _Stopper(FleetClient):
-    """A client that also stops and resets its arms, and hears what they are told."""
+    """A client that also stops and resets its arms, and hears what they are told; no command wakes it."""
 
     def __init__(self, fleet: dict[str, Metadata], seed: int) -> None:
         super().__init__(fleet, seed, lambda name, arm: None)
         node = self._node
         self._stop = node.create_publisher(Bool, ALL, 10, event_callbacks=qos.SILENT_PUBLISHER)
         self._resets = {name: node.create_client(Trigger, f"{name}/inference_node/reset") for name in fleet}
-        self.heard = {name: _Heard() for name in fleet}
         self._told: dict[str, Subscription] = {}
-        for name, metadata in fleet.items():
-            topic = f"{name}/{controller_topic(metadata.command.quantity)}"
-            take: Any = self.heard[name].take
-            node.create_subscription(Float64MultiArray, topic, take, 1000)
-            take = self.heard[name].take_source
-            node.create_subscription(Float64MultiArray, f"{name}/command_watchdog/commands", take, 1000)
+        self._heard = {name: _Heard() for name in fleet}
+        self._commands = {
+            name: (
+                self._keep(Float64MultiArray, f"{name}/{controller_topic(metadata.command.quantity)}"),
+                self._keep(Float64MultiArray, f"{name}/command_watchdog/commands"),
+            )
+            for name, metadata in fleet.items()
+        }
+
+    def _keep(self, kind: type, topic: str) -> Subscription:
+        return self._node.create_subscription(kind, topic, nobody, 100_000, callback_group=Unawaited())
+
+    @property
+    def heard(self) -> dict[str, _Heard]:
+        """Commands until now."""
+        for name, heard in self._heard.items():
+            heard.take(*self._commands[name])
+        return self._heard
 
     def listen(self) -> None:
-        """Have the joint states kept from now on; nobody is woken by them."""
-        for name in self.arms:
-            self._told[name] = self._node.create_subscription(
-                JointState, f"{name}/{joint_states.TOPIC}", nobody, 100_000, callback_group=Unawaited()
-            )
+        """Have the joint states kept from now on."""
+        self._told = {name: self._keep(JointState, f"{name}/{joint_states.TOPIC}") for name in self.arms}
 
     def told(self) -> dict[str, np.ndarray]:
         """Return when each arm sent where its first joint is, ns since 1970 and rad, [n, 2]."""
@@ -139,21 +152,21 @@ class _Stopper(FleetClient):
 
         def moving() -> bool:
             nonlocal since
-            now = time.monotonic()
+            now, heard = time.monotonic(), self.heard
             for name, arm in self.arms.items():
                 # Also out of a FAULT: on a busy computer a policy is too slow now and then.
                 if arm.state in (State.ESTOP.value, State.FAULT.value) and now - asked[name] > _AGAIN:
                     self._resets[name].call_async(Trigger.Request())
                     asked[name] = now
-                elif self.heard[name].still[-1] and now - arm.since > _AGAIN:  # also where a joint is at its limit
+                elif heard[name].stands and now - arm.since > _AGAIN:  # also where a joint is at its limit
                     self._send(arm)
-            if not all(map(_on_its_way, self.arms.values())) or any(heard.still[-1] for heard in self.heard.values()):
+            if not all(map(_on_its_way, self.arms.values())) or any(each.stands for each in heard.values()):
                 since = now
             return now - since > MOVING
 
         self._wait(moving, "arms that move")
 
-    def periods(self, nodes: list[ForkedNode]) -> np.ndarray:
+    def periods(self, nodes: list[ForkedProcess]) -> np.ndarray:
         """Drive for a while, and return what passed between two commands of each inference node, s."""
         self.drive(nodes, 0.5, 2.0)
         self.forget()
@@ -226,7 +239,7 @@ def measure_fleet(seed: int) -> FleetFigures:
     return FleetFigures(np.array(zeros), (alone, watched), np.concatenate(old), cpu)
 
 
-def _address(client: _Stopper, page: NodeProcess, nodes: list[ForkedNode]) -> tuple[str, int]:
+def _address(client: _Stopper, page: NodeProcess, nodes: list[ForkedProcess]) -> tuple[str, int]:
     until = time.monotonic() + 2 * _PATIENCE  # it gives way to all others
     while not (found := re.search(r"http://([^\s:]+):([0-9]+)", page.log.read_text())):
         if page.ended or time.monotonic() > until:
@@ -239,12 +252,13 @@ def _ages(shown: np.ndarray, told: np.ndarray) -> np.ndarray:
     return ages(shown, told, range(int(told[0, 0]) + _SETTLED, int(told[-1, 0]), _GRID))
 
 
-def _cpu_seconds(nodes: list[ForkedNode], page: NodeProcess) -> dict[str, float]:
+def _cpu_seconds(nodes: list[ForkedProcess], page: NodeProcess) -> dict[str, float]:
     """By kind of node."""
     seconds: defaultdict[str, float] = defaultdict(float)
-    processes = [(node.module, node.pid) for node in nodes] + [(page.module, page.pid)]
-    for module, pid in processes:
-        seconds[module.rpartition(".")[2]] += cpu_seconds(pid)
+    processes = [(node.name.partition(" of ")[0], node.pid) for node in nodes] + [(page.module, page.pid)]
+    for name, pid in processes:
+        seconds[name.rpartition(".")[2]] += cpu_seconds(pid)
+    seconds["this benchmark"] = time.process_time()
     return dict(seconds)
 
 

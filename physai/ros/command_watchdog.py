@@ -40,10 +40,14 @@ class WatchdogConfig(Parameters):
 
 
 class CommandWatchdog(StoppableNode[WatchdogConfig]):
-    """Passes commands on while they come."""
+    """Passes commands on while they come.
 
-    def __init__(self) -> None:
-        super().__init__("command_watchdog", WatchdogConfig)
+    Args:
+        arguments: What ROS is told of it, where it is not alone in its process.
+    """
+
+    def __init__(self, arguments: list[str] | None = None) -> None:
+        super().__init__("command_watchdog", WatchdogConfig, arguments)
         config = self.config
         # Before the commands: who hears of these knows then that they are ours.
         self._heartbeat = self.create_publisher(Empty, "~/heartbeat", qos.COMMAND, event_callbacks=qos.SILENT_PUBLISHER)

@@ -22,7 +22,7 @@ from physai.errors import UserError
 from physai.ros.driving.policies import newest_policies, robot_overrides
 
 if TYPE_CHECKING:
-    from physai.ros.driving.forked import ForkedNode
+    from physai.ros.driving.forked import ForkedProcess
 
 _FOREVER = 1e9  # s
 _PATIENCE = 60.0  # s, for the dashboard to start
@@ -87,8 +87,8 @@ def _check(node: DictConfig) -> None:
 def _fleet(node: DictConfig, _: Path) -> None:
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"  # no robot but ours shall hear of this
     from physai.ros.driving.fleet_client import Arm, FleetClient
-    from physai.ros.driving.fleet_nodes import fleet_nodes
-    from physai.ros.driving.forked import ForkedNode, end
+    from physai.ros.driving.forked import end, forked_node
+    from physai.ros.fleet_nodes import fleet_nodes
 
     config = validate(FleetConfig, node)
     fleet = config.fleet()
@@ -110,7 +110,7 @@ def _fleet(node: DictConfig, _: Path) -> None:
         nodes = stack.enter_context(fleet_nodes(fleet, config.robot, config.max_velocity, config.seed, logs))
         page = None
         if config.render == "web":
-            page = ForkedNode("physai.ros.dashboard", logs / "dashboard", "/", **config.web.model_dump())
+            page = forked_node("physai.ros.dashboard", logs / "dashboard", "/", **config.web.model_dump())
             stack.callback(end, [page])
         client = FleetClient({name: metadata for name, (_, metadata) in fleet.items()}, config.seed, tell)
         stack.enter_context(closing(client))
@@ -127,7 +127,7 @@ def _fleet(node: DictConfig, _: Path) -> None:
             console.print(f"{namespace}: {arm.reached} of {arm.sent} goals reached; {arm.state}")
 
 
-def _address(page: "ForkedNode") -> str:
+def _address(page: "ForkedProcess") -> str:
     """Wait until the dashboard says where it is, and return that, or why it does not."""
     until = time.monotonic() + _PATIENCE
     while time.monotonic() < until:

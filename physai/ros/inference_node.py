@@ -62,13 +62,14 @@ class InferenceNode(StoppableNode[InferenceConfig]):
 
     Args:
         kind: Its parameters.
+        arguments: What ROS is told of it, where it is not alone in its process.
 
     Raises:
         UserError: If a parameter or the policy file is wrong.
     """
 
-    def __init__(self, kind: type[InferenceConfig] = InferenceConfig) -> None:
-        super().__init__("inference_node", kind)
+    def __init__(self, kind: type[InferenceConfig] = InferenceConfig, arguments: list[str] | None = None) -> None:
+        super().__init__("inference_node", kind, arguments)
         config = self.config
         self._known = time.monotonic() + _DISCOVERY  # when who else commands the robot will surely have been found
         self._arrived = time.monotonic()  # when commands reached the robot, for the last time
@@ -85,6 +86,8 @@ class InferenceNode(StoppableNode[InferenceConfig]):
         self._publishing = False  # whether this node has a say in what the arm does
         self._contested = False
         self._blocked: list[str] = []  # by interlocks
+        self._untold = False  # whether the state has changed since it was announced
+        self._stopped_by = ""
         self._answered = -math.inf  # when a joint state was answered, for the last time
         self._timing = Timing()
         joints = config.joints or policy.metadata.joints
@@ -113,8 +116,7 @@ class InferenceNode(StoppableNode[InferenceConfig]):
             self.get_logger().error(self._disabled)
         if self._stop_file.stopped:
             self._emergency_stop("before this start")
-        else:
-            self._announce()
+        self._announce()
         self._descriptions.publish(String(data=description.urdf(policy.metadata, self._frames())))
         self._asked.publish(String(data=describe_goal(policy.metadata)))
         self.get_logger().info(
@@ -151,6 +153,7 @@ class InferenceNode(StoppableNode[InferenceConfig]):
         self._answered = time.monotonic()
         self._timing.tick(self._answered)
         self._tick()
+        self._announce_changes()
 
     def _take_goal(self, message: Any) -> None:
         self._goal = goals.from_message(message, self._controller.policy.metadata.goal)
@@ -159,6 +162,7 @@ class InferenceNode(StoppableNode[InferenceConfig]):
         if not request.data:
             self._enabled, self._disabled = False, "not enabled"
             self._tick()
+            self._announce_changes()
             response.success, response.message = True, "disabled: the arm stands"
             return response
         permitted, self._enabled = self._enabled, True
@@ -172,6 +176,7 @@ class InferenceNode(StoppableNode[InferenceConfig]):
 
     def _estop(self) -> tuple[bool, str]:
         self._emergency_stop("by ~/estop")
+        self._announce_changes()
         return True, "stopped until ~/reset"
 
     def _reset(self) -> tuple[bool, str]:
@@ -182,6 +187,7 @@ class InferenceNode(StoppableNode[InferenceConfig]):
             self._goal = None
         self._robot.hear()
         self._tick()
+        self._announce_changes()
         self._stop_file.forget()
         said = "waiting for a new goal" if latched else "nothing to reset"
         return True, "; ".join([said, *self._blocked])
@@ -195,8 +201,8 @@ class InferenceNode(StoppableNode[InferenceConfig]):
             return
         self._publishing = True
         self._controller.emergency_stop()
-        self._tick()
-        self.get_logger().error(f"emergency stop {source}")
+        self._stopped_by = source
+        self._tick()  # to tell of it waits for the next tick: zeros of other robots on this computer come before
 
     # What goes out
 
@@ -206,6 +212,7 @@ class InferenceNode(StoppableNode[InferenceConfig]):
             self._timing.tick(now)
             self._robot.hear()
             self._tick()
+        self._announce_changes()
 
     def _tick(self) -> None:
         now = time.monotonic()
@@ -226,7 +233,7 @@ class InferenceNode(StoppableNode[InferenceConfig]):
                 self.get_logger().warning(reason, throttle_duration_sec=1.0)
         if command.state is not before.state or interlocks != self._blocked:
             self._blocked = interlocks
-            self._announce()
+            self._untold = True
 
     def _interlocks(self, now: float) -> list[str]:
         """Why the arm must not move, beside what the controller knows."""
@@ -283,10 +290,18 @@ class InferenceNode(StoppableNode[InferenceConfig]):
         ordered[self._index] = values
         return ordered.tolist()
 
+    def _announce_changes(self) -> None:
+        if self._untold:
+            self._announce()
+
     def _announce(self) -> None:
+        self._untold = False
         command = self._command
         if command.state is State.ESTOP:
             self._stop_file.remember()
+            if self._stopped_by:
+                self.get_logger().error(f"emergency stop {self._stopped_by}")
+                self._stopped_by = ""
         self._states.publish(String(data=command.state.value))
         self._estopped.publish(Bool(data=command.state is State.ESTOP))
         self._diagnose()
@@ -325,6 +340,7 @@ class InferenceNode(StoppableNode[InferenceConfig]):
         """See that the last command that the robot got stands still."""
         if self._publishing:
             self._commands.finish()
+        self._announce_changes()
         self._stop_file.close(_DISK)
 
 

@@ -47,12 +47,15 @@ _LONGEST_PAUSE = 1.0  # s that the arm makes up for; in a longer one, such as a 
 class VirtualRobot(StoppableNode[VirtualRobotConfig]):
     """Publishes joint_states, and obeys the commands of its robot's controller as the real one does.
 
+    Args:
+        arguments: What ROS is told of it, where it is not alone in its process.
+
     Raises:
         UserError: If a parameter is wrong.
     """
 
-    def __init__(self) -> None:
-        super().__init__("virtual_robot", VirtualRobotConfig)
+    def __init__(self, arguments: list[str] | None = None) -> None:
+        super().__init__("virtual_robot", VirtualRobotConfig, arguments)
         config = self.config
         self._arm = VirtualArm(
             config.env, config.randomization, config.seed, 1.0 / config.rate_hz, config.overrides, config.physics

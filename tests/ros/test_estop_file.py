@@ -147,6 +147,18 @@ def test_a_node_killed_in_an_emergency_stop_is_in_it_when_it_starts_again(policy
 
 
 @pytest.mark.slow
+def test_a_node_that_is_ended_as_soon_as_its_zeros_have_come_remembers_the_stop(policy_path, peer, tmp_path):
+    """What it tells and writes comes a tick after its zeros, and this one often never comes to that tick."""
+    with closed_loop(policy_path, peer=peer, state=tmp_path, goal=list(FAR)) as loop:
+        peer.moved(after=time.monotonic())
+        peer.emergency_stop()
+        wait_for(lambda: not any(peer.commands[-1][1]), what="zeros")
+        loop.node.signal(signal.SIGTERM)
+        assert loop.node.wait() == 0
+    assert list((tmp_path / "physai").glob("*.estop"))
+
+
+@pytest.mark.slow
 @pytest.mark.skipif(not os.path.exists("/proc/self/status"), reason="needs a folder that even root cannot write to")
 @pytest.mark.fault("the folder for that cannot be written")
 def test_without_a_place_to_remember_it_a_node_does_not_start_by_itself(policy_path):

@@ -25,7 +25,7 @@ class Spun:
         self.context = Context()
         rclpy.init(context=self.context, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
         self.node = Node("spun", context=self.context)
-        self.executor = Executor(self.node)
+        self.executor = Executor([self.node])
 
     def until(self, done, seconds=10.0):
         end = time.monotonic() + seconds
@@ -66,6 +66,23 @@ def test_calls_whoever_a_message_a_timer_a_request_an_answer_and_a_trigger_are_f
     asked = client.call_async(Trigger.Request())
     asked.add_done_callback(lambda future: called.add(future.result().message))
     spun.until(lambda: called == {"message", dict, "timer", "request", "here", "trigger"})
+
+
+def test_calls_back_each_of_several_nodes_also_for_what_is_made_later(spun):
+    other, called = Node("other", context=spun.context), []
+    both = Executor([spun.node, other])
+    spun.node.create_subscription(Empty, "topic", lambda _: called.append("first"), 1)
+    publisher = spun.node.create_publisher(Empty, "topic", 1)
+    both.spin_once(0.0)
+    other.create_subscription(Empty, "topic", lambda _: called.append("other"), 1)
+    spun.until(lambda: publisher.get_subscription_count() == 2)
+    publisher.publish(Empty())
+    end = time.monotonic() + 10.0
+    while sorted(called) != ["first", "other"]:
+        assert time.monotonic() < end, called
+        both.spin_once(0.05)
+    both.shutdown(1.0)
+    other.destroy_node()
 
 
 def test_messages_come_before_the_timer_that_is_due_with_them(spun):

@@ -10,6 +10,7 @@ import pytest
 from geometry_msgs.msg import PointStamped
 from rclpy.duration import Duration
 from rosbags.rosbag2 import Reader
+from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool, Float64MultiArray, String
 
 from physai.ros.topics import qos
@@ -147,6 +148,38 @@ def test_the_recorder_takes_all_robots_those_that_come_later_too(start, peer, tm
             "/arm1/inference_node/state",
             "/left/arm2/inference_node/state",
         }
+
+
+TOGETHER = """
+import sys
+from functools import partial
+from physai.ros.node.run import run_together
+from physai.ros.virtual_robot import VirtualRobot
+
+def robot(namespace, rate):
+    return partial(VirtualRobot, ["--ros-args", "-r", f"__ns:={namespace}", "-p", f"rate_hz:={rate}"])
+
+sys.exit(run_together([robot("/left", 25), robot("/right", sys.argv[1])]))
+"""
+
+
+@pytest.mark.slow
+def test_nodes_that_share_a_process_have_their_own_namespaces_and_parameters_and_end_together(start, peer):
+    process = start.run([sys.executable, "-c", TOGETHER, "100"])
+    came = {"/left": [], "/right": []}
+    for namespace, times in came.items():
+        peer.listen(JointState, f"{namespace}/joint_states", times, 10, lambda message: message.name)
+    wait_for(lambda: len(came["/left"]) > 25, 60.0, "joint states")
+    assert 3.0 < len(came["/right"]) / len(came["/left"]) < 5.0
+    process.signal(signal.SIGTERM)
+    assert process.wait(30) == 0, process.output
+
+
+@pytest.mark.slow
+def test_nodes_that_share_a_process_do_not_start_if_one_of_them_cannot(start):
+    process = start.run([sys.executable, "-c", TOGETHER, "0"])
+    assert process.wait(60) == 2
+    assert process.lines[-1].startswith("error: rate_hz: must be")
 
 
 def fleet(*overrides: str) -> list[str]:

@@ -13,7 +13,7 @@ from std_msgs.msg import String
 
 from physai.deploy import Metadata, State
 from physai.errors import UserError
-from physai.ros.driving.forked import ForkedNode
+from physai.ros.driving.forked import ForkedProcess
 from physai.ros.node.guest import Guest
 from physai.ros.topics import goals, joint_states, qos
 from physai.seeding import derive
@@ -76,7 +76,7 @@ class FleetClient:
             node.create_subscription(String, f"{name}/state", partial(self._take_state, namespace), qos.LATCHED)
         node.create_subscription(DiagnosticArray, "/diagnostics", self._take_diagnostics, 100)
 
-    def wait_until_ready(self, nodes: list[ForkedNode]) -> None:
+    def wait_until_ready(self, nodes: list[ForkedProcess]) -> None:
         """Wait until each inference node waits for a goal.
 
         Raises:
@@ -93,7 +93,7 @@ class FleetClient:
             told = ", ".join(f"{name}: {arm.why or arm.state or 'silent'}" for name, arm in self.arms.items())
             raise UserError(f"not all nodes work after {_START:g} s: {told}")
 
-    def drive(self, nodes: list[ForkedNode], hold: float, seconds: float) -> None:
+    def drive(self, nodes: list[ForkedProcess], hold: float, seconds: float) -> None:
         """Send each arm a goal, and another one a while after it has reached it or given up, s.
 
         Raises:
@@ -149,7 +149,7 @@ class FleetClient:
         self._guest.close()
 
 
-def check(nodes: list[ForkedNode]) -> None:
+def check(nodes: list[ForkedProcess]) -> None:
     """See that all nodes run.
 
     Raises:
@@ -157,4 +157,4 @@ def check(nodes: list[ForkedNode]) -> None:
     """
     for node in nodes:
         if node.ended:
-            raise UserError(f"{node.module} of {node.namespace} has ended: {node.last_words()}")
+            raise UserError(f"{node.name} has ended: {node.last_words()}")

@@ -5,7 +5,7 @@ import os
 import signal
 import sys
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from importlib import import_module
 from pathlib import Path
 
@@ -14,32 +14,27 @@ from physai.processes import die_with, signals_wait
 _PATIENCE = 5.0  # s
 
 
-class ForkedNode:
-    """A node of physai in a process that is forked from this one, which must not have started ROS yet.
+class ForkedProcess:
+    """Nodes of physai in a process that is forked from this one, which must not have started ROS yet.
 
     It ends with this process. Ctrl-C is for this one alone, which ends its nodes in their order.
 
     Args:
-        module: Such as ``physai.ros.virtual_robot``.
+        name: What it is, for who reads of its end.
         log: Where its output goes; what it has to remember is kept beside.
-        namespace: Of the node.
-        parameters: ROS parameters by name.
+        work: What it does; returns its exit code.
+        arguments: Of its command line.
     """
 
-    def __init__(self, module: str, log: Path, namespace: str, **parameters: object) -> None:
-        self.module = module
-        self.namespace = namespace
+    def __init__(self, name: str, log: Path, work: Callable[[], int], arguments: Sequence[str] = ()) -> None:
+        self.name = name
         self.log = log
         self._code: int | None = None
-        node = import_module(module)
-        arguments = [module, "--ros-args", "-r", f"__ns:={namespace}"]
-        for name, value in parameters.items():
-            arguments += ["-p", f"{name}:={str(value).lower() if isinstance(value, bool) else value}"]
         this = os.getpid()
         with signals_wait():
             self.pid = os.fork()
             if self.pid == 0:
-                _become(node.main, arguments, log, this)
+                _become(work, [name, *arguments], log, this)
 
     @property
     def ended(self) -> bool:
@@ -56,20 +51,41 @@ class ForkedNode:
         return lines[-1] if lines else "no output"
 
 
-def end(nodes: Iterable[ForkedNode]) -> None:
-    """Have nodes end, side by side, and wait for them."""
-    nodes = list(nodes)
+def forked_node(module: str, log: Path, namespace: str, **parameters: object) -> ForkedProcess:
+    """Fork a node that is alone in its process.
+
+    Args:
+        module: Such as ``physai.ros.inference_node``.
+        log: Where its output goes.
+        namespace: Of the node.
+        parameters: ROS parameters by name.
+    """
+    arguments = ros_arguments(namespace, **parameters)
+    return ForkedProcess(f"{module} of {namespace}", log, import_module(module).main, arguments)
+
+
+def ros_arguments(namespace: str, **parameters: object) -> list[str]:
+    """What ROS is told of a node."""
+    arguments = ["--ros-args", "-r", f"__ns:={namespace}"]
+    for name, value in parameters.items():
+        arguments += ["-p", f"{name}:={str(value).lower() if isinstance(value, bool) else value}"]
+    return arguments
+
+
+def end(processes: Iterable[ForkedProcess]) -> None:
+    """Have processes end, side by side, and wait for them."""
+    processes = list(processes)
     for number, patience in ((signal.SIGTERM, _PATIENCE), (signal.SIGKILL, _PATIENCE)):
-        for node in nodes:
-            if not node.ended:
-                os.kill(node.pid, number)
+        for process in processes:
+            if not process.ended:
+                os.kill(process.pid, number)
         until = time.monotonic() + patience
-        while not all(node.ended for node in nodes) and time.monotonic() < until:
+        while not all(process.ended for process in processes) and time.monotonic() < until:
             time.sleep(0.01)
 
 
-def _become(main: object, arguments: Sequence[str], log: Path, parent: int) -> None:
-    """Be the node; nothing of the program that was forked goes on."""
+def _become(work: Callable[[], int], arguments: Sequence[str], log: Path, parent: int) -> None:
+    """Be the nodes; nothing of the program that was forked goes on."""
     code = 1
     try:
         die_with(parent, signal.SIGTERM)
@@ -79,8 +95,7 @@ def _become(main: object, arguments: Sequence[str], log: Path, parent: int) -> N
             os.dup2(number, target)
         os.environ["XDG_STATE_HOME"] = str(log.parent.absolute())  # no other robot's emergency stop
         sys.argv = list(arguments)
-        assert callable(main)
-        code = main()
+        code = work()
     finally:
         with contextlib.suppress(OSError):
             sys.stdout.flush()

@@ -2,7 +2,7 @@
 
 import contextlib
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
@@ -18,7 +18,7 @@ _LOOK = 1.0  # s between two looks for what the middleware has to say: that is f
 
 
 class Executor(executors.Executor):
-    """Waits for messages, timers and requests of a node, and calls whoever they are for.
+    """Waits for messages, timers and requests of nodes, and calls whoever they are for.
 
     rclpy's single-threaded executor gathers all that it waits for anew before each callback, and again after it, which
     costs more than most callbacks do. This one does so when something was made or destroyed, and after a wait it calls
@@ -26,17 +26,18 @@ class Executor(executors.Executor):
     no tasks and no actions, and things are made and destroyed in the thread that spins.
 
     Args:
-        node: Whose callbacks they are.
+        nodes: Whose callbacks they are; all of one context.
         ends: Whether nobody is to be called any more, also of those who are ready.
     """
 
-    def __init__(self, node: Node, ends: Callable[[], bool] = lambda: False) -> None:
-        super().__init__(context=node.context)
+    def __init__(self, nodes: Sequence[Node], ends: Callable[[], bool] = lambda: False) -> None:
+        super().__init__(context=nodes[0].context)
         self._ends = ends
-        self._node = node
+        self._of = nodes
         self._changed = True
         self._looked = time.monotonic()
-        self.add_node(node)
+        for node in nodes:
+            self.add_node(node)
 
     def wake(self) -> None:
         """Gather anew what there is to wait for; rclpy calls this when something was made or destroyed."""
@@ -81,15 +82,19 @@ class Executor(executors.Executor):
             self._look()
 
     def _gather(self) -> None:
-        node = self._node
         found: dict[str, list[Any]] = {
-            kind: [entity for entity in entities if entity.callback_group.can_execute(entity)]
+            kind: [
+                entity
+                for node in self._of
+                for entity in getattr(node, entities)
+                if entity.callback_group.can_execute(entity)
+            ]
             for kind, entities in (
-                ("guard_condition", node.guards),
-                ("subscription", node.subscriptions),
-                ("timer", node.timers),
-                ("client", node.clients),
-                ("service", node.services),
+                ("guard_condition", "guards"),
+                ("subscription", "subscriptions"),
+                ("timer", "timers"),
+                ("client", "clients"),
+                ("service", "services"),
             )
         }
         guards, subscriptions, timers, clients, services = map(len, found.values())
@@ -103,7 +108,7 @@ class Executor(executors.Executor):
 
     def _look(self) -> None:
         """Have said what the middleware knows, such as that a publisher offers another quality of service."""
-        events = list(self._node.waitables)
+        events = [event for node in self._of for event in node.waitables]
         waits = rclpy_implementation.WaitSet(0, 0, 0, 0, 0, len(events), self._context.handle)
         waits.clear_entities()
         for event in events:

@@ -38,7 +38,7 @@ class Guest:
         except RuntimeError as error:  # RCLError
             raise UserError(brief(error)) from error
         self.node = Node(name, context=self._context, start_parameter_services=False, enable_rosout=False)
-        self.executor = Executor(self.node)
+        self.executor = Executor([self.node])
 
     def close(self) -> None:
         """Leave ROS."""

@@ -8,9 +8,10 @@ import signal
 import sys
 import traceback
 from abc import abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
 from importlib.resources import files
-from typing import Generic
+from typing import Any, Generic
 
 import rclpy
 from rclpy.clock import Clock, ClockType
@@ -40,6 +41,7 @@ class StoppableNode(Node, Generic[P]):
     Args:
         name: Of the node.
         kind: Its parameters.
+        arguments: What ROS is told of it, such as its parameters, where it is not alone in its process.
 
     Attributes:
         config: The values of the parameters, as they are now.
@@ -52,8 +54,8 @@ class StoppableNode(Node, Generic[P]):
 
     stopped, code = False, 0
 
-    def __init__(self, name: str, kind: type[P]) -> None:
-        super().__init__(name)
+    def __init__(self, name: str, kind: type[P], arguments: list[str] | None = None) -> None:
+        super().__init__(name, cli_args=arguments, use_global_arguments=arguments is None)
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.config = declare(self, kind, self._change)
 
@@ -109,13 +111,23 @@ def run(make_node: Callable[[], StoppableNode[P]], module: str, about: str, kind
         prepare_middleware()
     except (RuntimeError, UserError) as error:  # RCLError: such as a file of parameters that does not exist
         return _refuse(brief(error))
-    with outlets():
-        try:
-            return _run(make_node, caught)
-        finally:
-            gc.collect()  # a node that was refused half made: it must go while ROS still works
-            rclpy.try_shutdown()
-            signals.ignore()
+    return _run([make_node], sys.argv[1:], caught)
+
+
+def run_together(make_nodes: Sequence[Callable[[], StoppableNode[Any]]]) -> int:
+    """Run nodes that belong together in one process and one thread; when one of them ends, all do.
+
+    Many processes that work for less than a millisecond each, in turns, find nothing of theirs in a core's caches.
+
+    Args:
+        make_nodes: Called in this order when ROS is up, each with ROS arguments of its own; they end in it, too.
+
+    Returns:
+        The exit code, as of :func:`run`.
+    """
+    caught = signals.catch()
+    prepare_middleware()
+    return _run(make_nodes, [], caught)
 
 
 def prepare_middleware() -> None:
@@ -132,10 +144,25 @@ def prepare_middleware() -> None:
         os.environ.setdefault("FASTDDS_BUILTIN_TRANSPORTS", "UDPv4")  # beyond LOCALHOST, where ROS chooses for itself
 
 
-def _run(make_node: Callable[[], StoppableNode[P]], caught: Mapping[int, object]) -> int:
+def _run(
+    make_nodes: Sequence[Callable[[], StoppableNode[Any]]], arguments: Sequence[str], caught: Mapping[int, object]
+) -> int:
+    with outlets():
+        try:
+            return _spin(make_nodes, arguments, caught)
+        finally:
+            gc.collect()  # a node that was refused half made: it must go while ROS still works
+            rclpy.try_shutdown()
+            signals.ignore()
+
+
+def _spin(
+    make_nodes: Sequence[Callable[[], StoppableNode[Any]]], arguments: Sequence[str], caught: Mapping[int, object]
+) -> int:
     try:
-        rclpy.init(args=[*sys.argv[:1], *_NO_LOG_FILES, *sys.argv[1:]], signal_handler_options=SignalHandlerOptions.NO)
-        node = make_node()
+        told = [*sys.argv[:1], *_NO_LOG_FILES, *arguments]
+        rclpy.init(args=told, signal_handler_options=SignalHandlerOptions.NO)
+        nodes = [make_node() for make_node in make_nodes]
     except (UserError, ParameterException) as error:  # such as a use_sim_time that is no bool
         return _refuse(str(error))
     except RuntimeError as error:  # RCLError
@@ -145,25 +172,33 @@ def _run(make_node: Callable[[], StoppableNode[P]], caught: Mapping[int, object]
         return 1
     gc.collect()
     gc.freeze()  # to look for garbage in all that is imported would hold up every command for a tenth of a second
-    executor = Executor(node, lambda: node.stopped or bool(caught))
-    last_words = ""
-    try:
-        while not node.stopped and not caught:
-            executor.spin_once(timeout_sec=0.1)
-    except UserError as error:
-        node.code, last_words = 2, str(error)
-    except Exception as error:
-        node.code, last_words = 1, f"{type(error).__name__} ends this node: {error}\n{traceback.format_exc()}"
-    finally:
-        node.finish()  # before anything else
-    log = node.get_logger()
+
+    def ends() -> bool:
+        return bool(caught) or any(node.stopped for node in nodes)
+
+    executor = Executor(nodes, ends)
+    code, last_words = 0, ""
+    with ExitStack() as stack:
+        for node in reversed(nodes):
+            stack.callback(node.finish)  # before anything else
+        try:
+            while not ends():
+                executor.spin_once(timeout_sec=0.1)
+        except UserError as error:
+            code, last_words = 2, str(error)
+        except Exception as error:
+            code, last_words = 1, f"{type(error).__name__} ends this node: {error}\n{traceback.format_exc()}"
+        for node in nodes:
+            node.code = code or node.code
+    log = nodes[0].get_logger()
     if last_words:
         log.fatal(last_words)
     else:
         log.info(f"{signal.Signals(next(iter(caught))).name} ends this node" if caught else "this node ends")
     executor.shutdown(timeout_sec=1.0)
-    node.destroy_node()
-    return node.code
+    for node in nodes:
+        node.destroy_node()
+    return max(node.code for node in nodes)
 
 
 def _of_ros(error: Exception) -> str:
