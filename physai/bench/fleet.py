@@ -8,7 +8,6 @@ import re
 import tempfile
 import time
 from argparse import Namespace
-from collections import defaultdict
 from contextlib import closing
 from dataclasses import dataclass, field
 from functools import partial
@@ -57,7 +56,7 @@ class FleetFigures:
         periods: Between the commands of the inference nodes, by their own clock, s: while nobody listens, and beside
             the dashboard, which somebody looks at.
         ages: Of the joint states that the page shows, from when the robot sent them, every 10 ms, s.
-        cpu: Share of a core, of the nodes of each kind together.
+        cpu: Share of a core, of each process.
     """
 
     zeros: np.ndarray
@@ -253,13 +252,9 @@ def _ages(shown: np.ndarray, told: np.ndarray) -> np.ndarray:
 
 
 def _cpu_seconds(nodes: list[ForkedProcess], page: NodeProcess) -> dict[str, float]:
-    """By kind of node."""
-    seconds: defaultdict[str, float] = defaultdict(float)
-    processes = [(node.name.partition(" of ")[0], node.pid) for node in nodes] + [(page.module, page.pid)]
-    for name, pid in processes:
-        seconds[name.rpartition(".")[2]] += cpu_seconds(pid)
-    seconds["this benchmark"] = time.process_time()
-    return dict(seconds)
+    """By whose they are."""
+    seconds = {node.name: cpu_seconds(node.pid) for node in nodes}
+    return seconds | {"page": cpu_seconds(page.pid), "this benchmark": time.process_time()}
 
 
 def fleet_table(figures: FleetFigures) -> Table:

@@ -43,7 +43,7 @@ class CommandWatchdog(StoppableNode[WatchdogConfig]):
     """Passes commands on while they come.
 
     Args:
-        arguments: What ROS is told of it, where it is not alone in its process.
+        arguments: ROS arguments of this node alone; None takes those of the command line.
     """
 
     def __init__(self, arguments: list[str] | None = None) -> None:

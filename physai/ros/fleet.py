@@ -7,6 +7,7 @@ import signal
 import tempfile
 import time
 from contextlib import ExitStack, closing
+from importlib import import_module
 from itertools import cycle, islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -26,8 +27,8 @@ if TYPE_CHECKING:
 
 _FOREVER = 1e9  # s
 _PATIENCE = 60.0  # s, for the dashboard to start
-_PER_CORE = 3  # arms of two joints, with their nodes
-_MOST = 9  # arms: more processes than that do not find each other on one computer's loopback
+_PER_CORE, _IN_TIME = 5, 16  # arms of two joints: with all their nodes; and whose inference nodes share one core
+_MOST = 64  # arms, of which a page shows no more
 
 
 class FleetConfig(Config):
@@ -87,7 +88,7 @@ def _check(node: DictConfig) -> None:
 def _fleet(node: DictConfig, _: Path) -> None:
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"  # no robot but ours shall hear of this
     from physai.ros.driving.fleet_client import Arm, FleetClient
-    from physai.ros.driving.forked import end, forked_node
+    from physai.ros.driving.forked import ForkedProcess, end, ros_arguments
     from physai.ros.fleet_nodes import fleet_nodes
 
     config = validate(FleetConfig, node)
@@ -103,14 +104,15 @@ def _fleet(node: DictConfig, _: Path) -> None:
         for namespace, (path, metadata) in fleet.items():
             console.print(f"{namespace}: {path} drives a virtual {metadata.robot}")
         cores = os.cpu_count() or 1
-        if config.arms > (enough := _PER_CORE * cores):
+        if config.arms > (enough := min(_PER_CORE * cores, _IN_TIME)):
             console.print(
                 f"{config.arms} arms are many for {cores} cores, and one that is late stops: try arms={enough}"
             )
         nodes = stack.enter_context(fleet_nodes(fleet, config.robot, config.max_velocity, config.seed, logs))
         page = None
         if config.render == "web":
-            page = forked_node("physai.ros.dashboard", logs / "dashboard", "/", **config.web.model_dump())
+            dashboard = import_module("physai.ros.dashboard").main  # needs viser
+            page = ForkedProcess("page", logs / "page", dashboard, ros_arguments("/", **config.web.model_dump()))
             stack.callback(end, [page])
         client = FleetClient({name: metadata for name, (_, metadata) in fleet.items()}, config.seed, tell)
         stack.enter_context(closing(client))

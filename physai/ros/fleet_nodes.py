@@ -8,7 +8,7 @@ from pathlib import Path
 from physai.deploy import ControllerConfig, Metadata
 from physai.deploy.limits import smallest_margin
 from physai.ros.command_watchdog import CommandWatchdog
-from physai.ros.driving.forked import ForkedProcess, end
+from physai.ros.driving.forked import ForkedProcess, end, ros_arguments
 from physai.ros.driving.policies import robot_overrides
 from physai.ros.inference_node import InferenceNode
 from physai.ros.node.run import run_together
@@ -21,8 +21,7 @@ def fleet_nodes(
 ) -> Iterator[list[ForkedProcess]]:
     """Context in which they run; this process must not have started ROS yet.
 
-    There are three processes: of the robots, of their watchdogs, and of who drives. A process for each node takes twice
-    the time: it works for a millisecond in its turn, and finds nothing of its own in the core's caches.
+    There are three processes: of the robots, of their watchdogs, and of who drives.
 
     Args:
         fleet: The policy file in each namespace, and what it says of itself.
@@ -31,16 +30,16 @@ def fleet_nodes(
         seed: Of the first robot; the others count on.
         logs: Folder for their output.
     """
-    robots, watchdogs, drivers = [], [], []
+    robots, watchdogs, drivers = {}, {}, {}
     for number, (namespace, (path, metadata)) in enumerate(fleet.items()):
         drawn = {"randomization": randomization, "seed": seed + number}
-        robots.append(partial(VirtualRobot, _arguments(namespace, **_robot(metadata), **drawn)))
-        watchdogs.append(partial(CommandWatchdog, _arguments(namespace, **_watchdog(metadata))))
-        told = _arguments(namespace, policy_path=path, **_driver(metadata, max_velocity))
-        drivers.append(partial(InferenceNode, arguments=told))
+        robots[namespace] = partial(VirtualRobot, ros_arguments(namespace, **_robot(metadata), **drawn))
+        watchdogs[namespace] = partial(CommandWatchdog, ros_arguments(namespace, **_watchdog(metadata)))
+        told = ros_arguments(namespace, policy_path=path, **_driver(metadata, max_velocity))
+        drivers[namespace] = partial(InferenceNode, arguments=told)
     processes: list[ForkedProcess] = []
     with ExitStack() as stack:
-        for name, nodes in (("robots", robots), ("watchdogs", watchdogs), ("inference nodes", drivers)):
+        for name, nodes in (("virtual robots", robots), ("watchdogs", watchdogs), ("inference nodes", drivers)):
             processes.append(ForkedProcess(name, logs / name, partial(run_together, nodes)))
             stack.callback(end, processes[-1:])  # who drives ends first, and the robots last
         yield processes
@@ -66,11 +65,3 @@ def _driver(metadata: Metadata, max_velocity: float) -> dict[str, object]:
         "max_velocity": max_velocity,
         "limit_margin": max(ControllerConfig.limit_margin, margin),
     }
-
-
-def _arguments(namespace: str, **parameters: object) -> list[str]:
-    """What ROS is told of a node."""
-    arguments = ["--ros-args", "-r", f"__ns:={namespace}"]
-    for name, value in parameters.items():
-        arguments += ["-p", f"{name}:={str(value).lower() if isinstance(value, bool) else value}"]
-    return arguments

@@ -62,7 +62,7 @@ class InferenceNode(StoppableNode[InferenceConfig]):
 
     Args:
         kind: Its parameters.
-        arguments: What ROS is told of it, where it is not alone in its process.
+        arguments: ROS arguments of this node alone; None takes those of the command line.
 
     Raises:
         UserError: If a parameter or the policy file is wrong.
@@ -182,6 +182,7 @@ class InferenceNode(StoppableNode[InferenceConfig]):
     def _reset(self) -> tuple[bool, str]:
         if (held := self._stop_topics.held()) is not None:
             return False, held
+        self._announce_changes()  # also of a stop that has just come
         latched = self._controller.reset()
         if latched:
             self._goal = None
@@ -202,7 +203,10 @@ class InferenceNode(StoppableNode[InferenceConfig]):
         self._publishing = True
         self._controller.emergency_stop()
         self._stopped_by = source
-        self._tick()  # to tell of it waits for the next tick: zeros of other robots on this computer come before
+        try:
+            self._tick()  # what tells of it comes with the next one, after the zeros of other robots on this computer
+        finally:
+            self._stop_file.remember()
 
     # What goes out
 
@@ -224,6 +228,9 @@ class InferenceNode(StoppableNode[InferenceConfig]):
             self._controller.not_sent()
         self._forget_old_goal(now)
         before, self._command = self._command, command
+        if command.state is not before.state or interlocks != self._blocked:
+            self._blocked = interlocks
+            self._untold = True
         if goal is not None and self._imu is None:  # velocities come many times a second
             self.get_logger().info(f"goal {goals.describe(goal, self._controller.policy.metadata.goal)}")
         for reason in command.reasons:
@@ -231,9 +238,6 @@ class InferenceNode(StoppableNode[InferenceConfig]):
                 self.get_logger().warning(reason)
             elif reason.startswith(("goal", "joint state rejected", "IMU rejected")):
                 self.get_logger().warning(reason, throttle_duration_sec=1.0)
-        if command.state is not before.state or interlocks != self._blocked:
-            self._blocked = interlocks
-            self._untold = True
 
     def _interlocks(self, now: float) -> list[str]:
         """Why the arm must not move, beside what the controller knows."""
@@ -298,7 +302,7 @@ class InferenceNode(StoppableNode[InferenceConfig]):
         self._untold = False
         command = self._command
         if command.state is State.ESTOP:
-            self._stop_file.remember()
+            self._stop_file.wait()
             if self._stopped_by:
                 self.get_logger().error(f"emergency stop {self._stopped_by}")
                 self._stopped_by = ""
@@ -338,10 +342,11 @@ class InferenceNode(StoppableNode[InferenceConfig]):
 
     def finish(self) -> None:
         """See that the last command that the robot got stands still."""
-        if self._publishing:
-            self._commands.finish()
-        self._announce_changes()
-        self._stop_file.close(_DISK)
+        try:
+            if self._publishing:
+                self._commands.finish()
+        finally:
+            self._stop_file.close(_DISK)
 
 
 def _commands(node: InferenceNode, joints: int, quantity: Quantity, config: InferenceConfig) -> JointCommands:

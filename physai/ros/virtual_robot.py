@@ -48,7 +48,7 @@ class VirtualRobot(StoppableNode[VirtualRobotConfig]):
     """Publishes joint_states, and obeys the commands of its robot's controller as the real one does.
 
     Args:
-        arguments: What ROS is told of it, where it is not alone in its process.
+        arguments: ROS arguments of this node alone; None takes those of the command line.
 
     Raises:
         UserError: If a parameter is wrong.

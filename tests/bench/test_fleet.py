@@ -37,7 +37,7 @@ def test_an_arm_is_driven_and_stopped(exported_run, tmp_path):
         env = {**os.environ, "ROS_DOMAIN_ID": str(domain), "PYTHONPATH": os.pathsep.join(sys.path)}
         command = [sys.executable, str(tmp_path / "measure.py"), str(exported_run)]
         ran = subprocess.run(command, env=env, capture_output=True, text=True, timeout=240)
-    parts = ["dashboard", "inference nodes", "robots", "this benchmark", "watchdogs"]
+    parts = ["inference nodes", "page", "this benchmark", "virtual robots", "watchdogs"]
     assert f"measured (2, 1) True True {parts}" in ran.stdout, ran.stdout + ran.stderr
     assert 0.005 < float(ran.stdout.split("median age")[1]) < 0.5
 

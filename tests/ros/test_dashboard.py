@@ -124,8 +124,13 @@ def test_robots_come_and_go_and_come_back(start, peer, policy_path, robot):
     assert not robot.is_in("estop")
     node.end()
     wait_for(lambda: not robots.all[1].present, 20.0, "a robot that is missed")
-    start("inference_node", "-r", "__ns:=/arm2", policy_path=policy_path)
+    node = start("inference_node", "-r", "__ns:=/arm2", "-r", "/emergency_stop:=/halt", policy_path=policy_path)
     wait_for(lambda: robots.all[1].present and robots.all[1].state == "estop", 30.0, "a robot that is back")
+    wait_for(lambda: peer.call("/arm2/inference_node/reset").success, 10.0, "a reset")
+    wait_for(lambda: robots.all[1].state == "waiting", 10.0, "a robot that waits")
+    robots.ask(Ask("stop all"))
+    wait_for(lambda: all(each.state == "estop" for each in robots.all), 10.0, "all, that with a topic of its own, too")
+    assert [each.said.startswith("estop") for each in robots.all] == [False, True]  # who hears it is not asked twice
 
 
 @pytest.mark.slow

@@ -31,6 +31,7 @@ def test_what_is_remembered_is_there_when_the_node_starts_again_until_it_is_forg
     file = EmergencyStopFile(NODE, 7)
     assert (file.stopped, file.unusable) == (False, "")
     file.remember()
+    file.wait()
     assert file.path == home / "domain_7.left.inference_node.estop"
     assert file.path.exists()
     closed(file)
@@ -80,6 +81,7 @@ def test_a_disk_that_refuses_is_told_of_and_asked_again(home):
     home.touch()
     since = time.monotonic()
     file.remember()
+    file.wait()
     assert time.monotonic() - since < 0.1
     wait_for(lambda: file.failures)
     assert "physai: " in file.failure
@@ -110,8 +112,10 @@ def test_a_disk_that_stands_still_keeps_nobody_waiting(home, monkeypatch):
     monkeypatch.setattr("os.fsync", lambda _: go.wait(10.0))
     since = time.monotonic()
     file.remember()
+    file.wait()
     file.forget()
     file.remember()
+    file.wait()
     file.close(0.2)
     assert time.monotonic() - since < 0.5
     go.set()
@@ -148,7 +152,7 @@ def test_a_node_killed_in_an_emergency_stop_is_in_it_when_it_starts_again(policy
 
 @pytest.mark.slow
 def test_a_node_that_is_ended_as_soon_as_its_zeros_have_come_remembers_the_stop(policy_path, peer, tmp_path):
-    """What it tells and writes comes a tick after its zeros, and this one often never comes to that tick."""
+    """What tells of it comes a tick after its zeros, and this one often never comes to that tick."""
     with closed_loop(policy_path, peer=peer, state=tmp_path, goal=list(FAR)) as loop:
         peer.moved(after=time.monotonic())
         peer.emergency_stop()

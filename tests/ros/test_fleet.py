@@ -156,16 +156,34 @@ from functools import partial
 from physai.ros.node.run import run_together
 from physai.ros.virtual_robot import VirtualRobot
 
-def robot(namespace, rate):
-    return partial(VirtualRobot, ["--ros-args", "-r", f"__ns:={namespace}", "-p", f"rate_hz:={rate}"])
+class Robot(VirtualRobot):
+    steps = 0
 
-sys.exit(run_together([robot("/left", 25), robot("/right", sys.argv[1])]))
+    def _step(self):
+        super()._step()
+        self.steps += 1
+        if self.get_namespace() == "/right" and self.steps == int(sys.argv[2]):
+            raise ValueError("it broke")
+
+    def finish(self):
+        super().finish()
+        print(self.get_namespace(), "has finished", flush=True)
+
+def robot(namespace, rate):
+    return partial(Robot, ["--ros-args", "-r", f"__ns:={namespace}", "-p", f"rate_hz:={rate}"])
+
+sys.exit(run_together({"/left": robot("/left", 25), "/right": robot("/right", sys.argv[1])}))
 """
+
+
+def together(start, rate: float, steps: int) -> Process:
+    """Start two robots in one process: the right one sends at that rate, and raises after so many steps."""
+    return start.run([sys.executable, "-c", TOGETHER, str(rate), str(steps)])
 
 
 @pytest.mark.slow
 def test_nodes_that_share_a_process_have_their_own_namespaces_and_parameters_and_end_together(start, peer):
-    process = start.run([sys.executable, "-c", TOGETHER, "100"])
+    process = together(start, 100.0, 0)
     came = {"/left": [], "/right": []}
     for namespace, times in came.items():
         peer.listen(JointState, f"{namespace}/joint_states", times, 10, lambda message: message.name)
@@ -173,13 +191,22 @@ def test_nodes_that_share_a_process_have_their_own_namespaces_and_parameters_and
     assert 3.0 < len(came["/right"]) / len(came["/left"]) < 5.0
     process.signal(signal.SIGTERM)
     assert process.wait(30) == 0, process.output
+    assert {"/left has finished", "/right has finished"} < set(process.lines)
+
+
+@pytest.mark.slow
+def test_when_one_of_the_nodes_that_share_a_process_breaks_all_of_them_finish(start):
+    process = together(start, 100.0, 20)
+    assert process.wait(60) == 1
+    assert {"/left has finished", "/right has finished"} < set(process.lines)
+    assert "ValueError ends this process: it broke" in process.output
 
 
 @pytest.mark.slow
 def test_nodes_that_share_a_process_do_not_start_if_one_of_them_cannot(start):
-    process = start.run([sys.executable, "-c", TOGETHER, "0"])
+    process = together(start, 0.0, 0)
     assert process.wait(60) == 2
-    assert process.lines[-1].startswith("error: rate_hz: must be")
+    assert process.lines[-1].startswith("error: /right: rate_hz: must lie between")
 
 
 def fleet(*overrides: str) -> list[str]:
@@ -198,13 +225,13 @@ def test_the_demo_drives_a_fleet_and_leaves_nothing_behind(start, policy_path):
 
 @pytest.mark.slow
 def test_ctrl_c_ends_the_demo_and_all_of_its_nodes_and_its_page(start, policy_path):
-    process = start.run(fleet(f"policies=[{policy_path}]", "arms=1", "render=web", "web.port=0"))
+    process = start.run(fleet(f"policies=[{policy_path}]", "arms=2", "render=web", "web.port=0"))
     process.says("all of them work", 60.0)
     address = process.says("the page: http://127.0.0.1:", 60.0).split()[-1]
     with urllib.request.urlopen(address, timeout=30.0) as page:
         assert b"viser" in page.read().lower()
     nodes = children(process)
-    assert len(nodes) == 4
+    assert len(nodes) == 4  # robots, watchdogs, who drives, the page
     process.signal(signal.SIGINT)
     assert process.wait(30) == 0, process.output
     assert not any(map(runs, nodes))
@@ -231,7 +258,7 @@ def runs(pid: int) -> bool:
 @pytest.mark.parametrize(
     ("overrides", "said"),
     [
-        (["arms=10"], "arms: 9 at most, got 10"),
+        (["arms=65"], "arms: 64 at most, got 65"),
         (["policies=[nowhere.pt]"], "nowhere.pt: no such file"),
         (["render=video"], "render: input should be 'web'"),
         (["arm=3"], "unknown key 'arm'; did you mean 'arms'?"),

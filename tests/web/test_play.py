@@ -57,6 +57,10 @@ def distance(page):
     return float(re.search(r"goal: ([\d.]+) m", page.get_by_text("to the goal").inner_text())[1])
 
 
+def counted(page, what):
+    return int(re.search(rf"{what}: ([0-9]+)", page.get_by_text("settled:").inner_text())[1])
+
+
 def upper_arm(image, seen):
     """Its pixels: those of the orange colour that are no farther from the base than it is long."""
     pixels = colored(image, *ORANGE)
@@ -141,6 +145,24 @@ def test_an_arm_follows_the_goal_that_the_mouse_drags_and_stands_still_when_paus
     wait_until(lambda: np.abs(goal_of(page, seen) - [x, there]).max() > 0.1)
     still = np.median(upper_arm(picture(page), seen), axis=0)
     assert still == pytest.approx(np.median(upper_arm(paused, seen), axis=0), abs=3.0)
+
+    far = distance(page)
+    for _ in range(5):
+        page.get_by_role("button", name="Step").click()
+    wait_until(lambda: far - distance(page) > 0.002)
+    time.sleep(1.0)
+    stepped = distance(page)
+    time.sleep(1.0)
+    assert distance(page) == stepped
+
+    menus = page.locator("input.mantine-Select-input").all()
+    next(menu for menu in menus if menu.input_value() == "pybullet").click()
+    page.get_by_role("option", name="mujoco").click()
+    page.get_by_role("button", name="Go on").click()
+    wait_until(lambda: distance(page) < 0.05)  # of the other engine's robot, which has a goal of its own
+    assert counted(page, "Goals") == 1
+    page.get_by_role("button", name="Reset").click()
+    wait_until(lambda: counted(page, "reached") == 0)
 
 
 @pytest.fixture

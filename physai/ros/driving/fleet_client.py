@@ -157,4 +157,4 @@ def check(nodes: list[ForkedProcess]) -> None:
     """
     for node in nodes:
         if node.ended:
-            raise UserError(f"{node.name} has ended: {node.last_words()}")
+            raise UserError(f"the process of the {node.name} has ended: {node.last_words()}")

@@ -6,7 +6,6 @@ import signal
 import sys
 import time
 from collections.abc import Callable, Iterable, Sequence
-from importlib import import_module
 from pathlib import Path
 
 from physai.processes import die_with, signals_wait
@@ -20,7 +19,7 @@ class ForkedProcess:
     It ends with this process. Ctrl-C is for this one alone, which ends its nodes in their order.
 
     Args:
-        name: What it is, for who reads of its end.
+        name: Whose it is, such as ``inference nodes``.
         log: Where its output goes; what it has to remember is kept beside.
         work: What it does; returns its exit code.
         arguments: Of its command line.
@@ -49,19 +48,6 @@ class ForkedProcess:
         """The last line of its output."""
         lines = [line for line in self.log.read_text(errors="replace").splitlines() if line.strip()]
         return lines[-1] if lines else "no output"
-
-
-def forked_node(module: str, log: Path, namespace: str, **parameters: object) -> ForkedProcess:
-    """Fork a node that is alone in its process.
-
-    Args:
-        module: Such as ``physai.ros.inference_node``.
-        log: Where its output goes.
-        namespace: Of the node.
-        parameters: ROS parameters by name.
-    """
-    arguments = ros_arguments(namespace, **parameters)
-    return ForkedProcess(f"{module} of {namespace}", log, import_module(module).main, arguments)
 
 
 def ros_arguments(namespace: str, **parameters: object) -> list[str]:

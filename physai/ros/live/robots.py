@@ -18,7 +18,7 @@ from sensor_msgs.msg import Imu, JointState
 from std_msgs.msg import Bool, String
 from std_srvs.srv import SetBool, Trigger
 
-from physai.deploy import PolicyError
+from physai.deploy import PolicyError, State
 from physai.deploy.metadata import read_goal
 from physai.errors import UserError
 from physai.ros.live.status import Status
@@ -33,6 +33,7 @@ _MOST = 64  # robots
 _FORGET = 300.0  # s after which a robot that has gone is not shown any more
 _STALE = 0.5  # s that what people ask may wait: what comes later, nobody expects any more
 _ANSWER = 5.0  # s
+_HEARD = 0.1  # s after which a robot that has heard a stop of all says that it stands
 _SERVICES = {"enable": SetBool, "reset": Trigger, "estop": Trigger}
 
 
@@ -79,6 +80,7 @@ class Robots:
         self._wake = node.create_guard_condition(self._work)
         self._everyone = _button(node, ALL) if commands else None
         self._looked = time.monotonic()
+        self._insists = math.inf  # when those are asked that have not stopped
         self.stopped: float | None = None
         node.create_subscription(DiagnosticArray, "/diagnostics", self._take_diagnostics, 100)
         node.create_timer(_HEAR, self._hear, clock=Clock(clock_type=ClockType.STEADY_TIME))
@@ -110,6 +112,10 @@ class Robots:
     def _hear(self) -> None:
         for link in self._links.values():
             link.hear()
+        if time.monotonic() >= self._insists:
+            self._insists = math.inf
+            for link in self._links.values():
+                link.insist()
 
     def _take_diagnostics(self, message: Any) -> None:
         for status in message.status:
@@ -125,6 +131,7 @@ class Robots:
             if wanted.what == "stop all" and self._everyone is not None:
                 self._everyone.publish(Bool(data=True))
                 self.stopped = time.monotonic()
+                self._insists = self.stopped + _HEARD
                 self._node.get_logger().warning("stop all: asked for on the page")
             elif (link := self._links.get(wanted.namespace)) is not None:
                 if not wanted.stops and time.monotonic() - wanted.at > _STALE:
@@ -258,6 +265,11 @@ class _Link:
             self._call("estop" if wanted.what == "stop" else "reset", Trigger.Request())
         elif wanted.what == "enable":
             self._call("enable", SetBool.Request(data=True))
+
+    def insist(self) -> None:
+        """Stop it by its service, if it has not stopped: it may listen to a topic of another name."""
+        if self.status.present and self.status.state != State.ESTOP.value:
+            self._call("estop", Trigger.Request())
 
     def _send(self, goal: np.ndarray | None) -> None:
         if self._goals is None or self._goal is None or goal is None or goal.shape != self._goal.shape:

@@ -48,13 +48,15 @@ class EmergencyStopFile:
         self._thread.start()
 
     def remember(self) -> None:
-        """Have the file made; waits a moment for it, so that who hears of the stop next can rely on it."""
+        """Have the file made; does not wait for it."""
         with self._changed:
-            if self._wanted:
-                return
             self._wanted = True
             self._changed.notify_all()
-            self._changed.wait_for(lambda: self._synced, _DISK)
+
+    def wait(self) -> None:
+        """Wait a moment for what was wanted last, so that who hears of it next can rely on it."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._synced == self._wanted, _DISK)
 
     def forget(self) -> None:
         """Have the file removed."""

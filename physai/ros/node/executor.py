@@ -1,4 +1,4 @@
-"""What calls a node's callbacks, in one thread, and with little work of its own between them."""
+"""What calls the callbacks of nodes, in one thread, and with little work of its own between them."""
 
 import contextlib
 import time
@@ -33,7 +33,7 @@ class Executor(executors.Executor):
     def __init__(self, nodes: Sequence[Node], ends: Callable[[], bool] = lambda: False) -> None:
         super().__init__(context=nodes[0].context)
         self._ends = ends
-        self._of = nodes
+        self._in_order = nodes
         self._changed = True
         self._looked = time.monotonic()
         for node in nodes:
@@ -85,7 +85,7 @@ class Executor(executors.Executor):
         found: dict[str, list[Any]] = {
             kind: [
                 entity
-                for node in self._of
+                for node in self._in_order
                 for entity in getattr(node, entities)
                 if entity.callback_group.can_execute(entity)
             ]
@@ -108,7 +108,7 @@ class Executor(executors.Executor):
 
     def _look(self) -> None:
         """Have said what the middleware knows, such as that a publisher offers another quality of service."""
-        events = [event for node in self._of for event in node.waitables]
+        events = [event for node in self._in_order for event in node.waitables]
         waits = rclpy_implementation.WaitSet(0, 0, 0, 0, 0, len(events), self._context.handle)
         waits.clear_entities()
         for event in events:

@@ -6,10 +6,10 @@ import os
 import re
 import signal
 import sys
+import threading
 import traceback
 from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack
 from importlib.resources import files
 from typing import Any, Generic
 
@@ -41,7 +41,7 @@ class StoppableNode(Node, Generic[P]):
     Args:
         name: Of the node.
         kind: Its parameters.
-        arguments: What ROS is told of it, such as its parameters, where it is not alone in its process.
+        arguments: ROS arguments of this node alone; None takes those of the command line.
 
     Attributes:
         config: The values of the parameters, as they are now.
@@ -108,26 +108,23 @@ def run(make_node: Callable[[], StoppableNode[P]], module: str, about: str, kind
     )
     try:
         parser.parse_args(remove_ros_args(sys.argv)[1:])
-        prepare_middleware()
-    except (RuntimeError, UserError) as error:  # RCLError: such as a file of parameters that does not exist
+    except RuntimeError as error:  # RCLError: such as a file of parameters that does not exist
         return _refuse(brief(error))
-    return _run([make_node], sys.argv[1:], caught)
+    return _run({"": make_node}, sys.argv[1:], caught)
 
 
-def run_together(make_nodes: Sequence[Callable[[], StoppableNode[Any]]]) -> int:
+def run_together(make_nodes: Mapping[str, Callable[[], StoppableNode[Any]]]) -> int:
     """Run nodes that belong together in one process and one thread; when one of them ends, all do.
 
-    Many processes that work for less than a millisecond each, in turns, find nothing of theirs in a core's caches.
+    Many processes whose turn is short find nothing of theirs in a core's caches.
 
     Args:
-        make_nodes: Called in this order when ROS is up, each with ROS arguments of its own; they end in it, too.
+        make_nodes: By namespace; called in this order when ROS is up, each with ROS arguments of its own.
 
     Returns:
         The exit code, as of :func:`run`.
     """
-    caught = signals.catch()
-    prepare_middleware()
-    return _run(make_nodes, [], caught)
+    return _run(make_nodes, [], signals.catch())
 
 
 def prepare_middleware() -> None:
@@ -145,8 +142,12 @@ def prepare_middleware() -> None:
 
 
 def _run(
-    make_nodes: Sequence[Callable[[], StoppableNode[Any]]], arguments: Sequence[str], caught: Mapping[int, object]
+    make_nodes: Mapping[str, Callable[[], StoppableNode[Any]]], arguments: Sequence[str], caught: Mapping[int, object]
 ) -> int:
+    try:
+        prepare_middleware()
+    except UserError as error:
+        return _refuse(str(error))
     with outlets():
         try:
             return _spin(make_nodes, arguments, caught)
@@ -157,14 +158,17 @@ def _run(
 
 
 def _spin(
-    make_nodes: Sequence[Callable[[], StoppableNode[Any]]], arguments: Sequence[str], caught: Mapping[int, object]
+    make_nodes: Mapping[str, Callable[[], StoppableNode[Any]]], arguments: Sequence[str], caught: Mapping[int, object]
 ) -> int:
+    nodes: list[StoppableNode[Any]] = []
+    name = ""
     try:
         told = [*sys.argv[:1], *_NO_LOG_FILES, *arguments]
         rclpy.init(args=told, signal_handler_options=SignalHandlerOptions.NO)
-        nodes = [make_node() for make_node in make_nodes]
+        for name in make_nodes:
+            nodes.append(make_nodes[name]())
     except (UserError, ParameterException) as error:  # such as a use_sim_time that is no bool
-        return _refuse(str(error))
+        return _refuse(f"{name}: {error}" if name else str(error))
     except RuntimeError as error:  # RCLError
         return _refuse(_of_ros(error))
     except Exception:  # said here: nothing can be said any more when this function has returned
@@ -177,28 +181,40 @@ def _spin(
         return bool(caught) or any(node.stopped for node in nodes)
 
     executor = Executor(nodes, ends)
+    what = "this node" if len(nodes) == 1 else "this process"
     code, last_words = 0, ""
-    with ExitStack() as stack:
-        for node in reversed(nodes):
-            stack.callback(node.finish)  # before anything else
-        try:
-            while not ends():
-                executor.spin_once(timeout_sec=0.1)
-        except UserError as error:
-            code, last_words = 2, str(error)
-        except Exception as error:
-            code, last_words = 1, f"{type(error).__name__} ends this node: {error}\n{traceback.format_exc()}"
+    try:
+        while not ends():
+            executor.spin_once(timeout_sec=0.1)
+    except UserError as error:
+        code, last_words = 2, str(error)
+    except Exception as error:
+        code, last_words = 1, f"{type(error).__name__} ends {what}: {error}\n{traceback.format_exc()}"
+    finally:
         for node in nodes:
             node.code = code or node.code
+        _finish(nodes)  # before anything else
     log = nodes[0].get_logger()
     if last_words:
         log.fatal(last_words)
     else:
-        log.info(f"{signal.Signals(next(iter(caught))).name} ends this node" if caught else "this node ends")
+        log.info(f"{signal.Signals(next(iter(caught))).name} ends {what}" if caught else f"{what} ends")
     executor.shutdown(timeout_sec=1.0)
     for node in nodes:
         node.destroy_node()
     return max(node.code for node in nodes)
+
+
+def _finish(nodes: Sequence[StoppableNode[Any]]) -> None:
+    """Let all of them finish side by side: each waits for those who hear it, and for its disk."""
+    others = [threading.Thread(target=node.finish) for node in nodes[1:]]
+    for other in others:
+        other.start()
+    try:
+        nodes[0].finish()
+    finally:
+        for other in others:
+            other.join()
 
 
 def _of_ros(error: Exception) -> str:
