@@ -1,5 +1,6 @@
 """What was found, in words and numbers."""
 
+from collections import Counter
 from typing import Any
 
 import numpy as np
@@ -79,7 +80,11 @@ def summary(found: Fit, spec: RobotSpec) -> dict[str, Any]:
 
 def _advice(found: Fit) -> list[str]:
     """What cannot be told, and what to record to tell it."""
-    lines = [f"Nothing in these motions tells {_words(direction, found)} apart." for direction in found.together]
+    together = Counter(_words(direction, found) for direction in found.together)
+    lines = [
+        f"Nothing in these motions tells {words} apart{f': {ways} of them must be known' if ways > 1 else ''}."
+        for words, ways in together.items()
+    ]
     unseen: dict[str, list[str]] = {}
     for label in np.array(found.unknowns.labels)[found.unseen]:
         unseen.setdefault(_SHOWS_IN[label.partition("[")[0]], []).append(label)
