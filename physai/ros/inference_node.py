@@ -176,12 +176,14 @@ class InferenceNode(StoppableNode[InferenceConfig]):
 
     def _estop(self) -> tuple[bool, str]:
         self._emergency_stop("by ~/estop")
+        self._stop_file.wait()
         self._announce_changes()
         return True, "stopped until ~/reset"
 
     def _reset(self) -> tuple[bool, str]:
         if (held := self._stop_topics.held()) is not None:
             return False, held
+        self._stop_file.wait()
         self._announce_changes()  # also of a stop that has just come
         latched = self._controller.reset()
         if latched:
@@ -295,17 +297,15 @@ class InferenceNode(StoppableNode[InferenceConfig]):
         return ordered.tolist()
 
     def _announce_changes(self) -> None:
-        if self._untold:
+        if self._untold and not self._stop_file.pending:
             self._announce()
 
     def _announce(self) -> None:
         self._untold = False
         command = self._command
-        if command.state is State.ESTOP:
-            self._stop_file.wait()
-            if self._stopped_by:
-                self.get_logger().error(f"emergency stop {self._stopped_by}")
-                self._stopped_by = ""
+        if command.state is State.ESTOP and self._stopped_by:
+            self.get_logger().error(f"emergency stop {self._stopped_by}")
+            self._stopped_by = ""
         self._states.publish(String(data=command.state.value))
         self._estopped.publish(Bool(data=command.state is State.ESTOP))
         self._diagnose()

@@ -13,7 +13,7 @@ from std_msgs.msg import Bool
 
 from tests.ros.peer import wait_for
 from tests.ros.test_fleet import Robot
-from tests.web.visitor import Visitor
+from tests.web.visitor import Visitor, shows
 
 ARM = ("-r", "__ns:=/arm1")
 
@@ -45,7 +45,7 @@ def test_what_happens_to_the_page_changes_nothing_on_a_robot(start, peer, robot)
     peer.listen(Bool, "/emergency_stop", stops, 10)
     visitor = Visitor(host, int(port))
     marker = "/robot_arm1/goal"
-    wait_for(lambda: _hears(visitor, marker), 30.0, "a goal to drag")
+    wait_for(lambda: shows(visitor, marker), 30.0, "a goal to drag")
 
     process.signal(signal.SIGSTOP)
     time.sleep(1.0)
@@ -73,7 +73,7 @@ def test_what_happens_to_the_page_changes_nothing_on_a_robot(start, peer, robot)
             return Visitor(host, int(port))
 
     other = wait_for(enter, 30.0, "room for another visitor")
-    wait_for(lambda: _hears(other, marker), 30.0, "the page again")
+    wait_for(lambda: shows(other, marker), 30.0, "the page again")
 
     def let_go() -> bool:  # a page that had no time for half a second does not do what was asked meanwhile
         other.drag(marker, (0.3, 0.1, 0.0), (-0.3, -0.2, 0.0))
@@ -88,21 +88,6 @@ def test_what_happens_to_the_page_changes_nothing_on_a_robot(start, peer, robot)
     time.sleep(1.0)
     wait_for(lambda: robot.states[-1][1] in ("active", "reached"), 5.0, "a robot that goes on")
     assert not stops
-
-
-def _hears(visitor: Visitor, name: str) -> bool:
-    with contextlib.suppress(TimeoutError):
-        while True:
-            if name.encode() in _unpacked(visitor.socket.recv(timeout=0.1)):
-                return True
-    return False
-
-
-def _unpacked(frame: bytes) -> bytes:
-    import zstandard
-
-    size = int.from_bytes(frame[8:16], "little")
-    return zstandard.ZstdDecompressor().decompress(frame[16 : 16 + size])
 
 
 @pytest.mark.slow

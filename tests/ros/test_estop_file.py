@@ -30,8 +30,10 @@ def closed(file: EmergencyStopFile) -> EmergencyStopFile:
 def test_what_is_remembered_is_there_when_the_node_starts_again_until_it_is_forgotten(home):
     file = EmergencyStopFile(NODE, 7)
     assert (file.stopped, file.unusable) == (False, "")
+    assert not file.pending
     file.remember()
     file.wait()
+    assert not file.pending
     assert file.path == home / "domain_7.left.inference_node.estop"
     assert file.path.exists()
     closed(file)

@@ -5,6 +5,7 @@ import dataclasses
 import importlib.util
 import math
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -30,6 +31,7 @@ from physai.ros.record import RecordConfig
 from physai.ros.topics import qos
 from physai.ros.virtual_robot import VirtualRobotConfig
 from tests.ros.peer import TOPIC, wait_for
+from tests.web.visitor import Visitor, shows
 
 REPOSITORY = Path(__file__).parents[2]
 PACKAGE = REPOSITORY / "physai" / "ros" / "package"
@@ -122,6 +124,25 @@ def test_the_wheel_has_no_benchmarks_and_no_need_of_them(wheel):
     assert "physai/__init__.py" in names
     assert not [name for name in names if name.startswith("physai/bench")]
     assert not [name for name in names if name.endswith(".py") and b"physai.bench" in archive.read(name)]
+
+
+@pytest.mark.slow
+def test_play_serves_its_page_from_the_wheel_in_another_folder_and_without_ros(venv, exported_run, tmp_path):
+    """Ten seconds: other tests have the working tree beside them, and ROS."""
+    shutil.copy(exported_run / "policy.pt", tmp_path)
+    (tmp_path / "without" / "rclpy").mkdir(parents=True)
+    (tmp_path / "without" / "rclpy" / "__init__.py").write_text("raise ImportError('there is no ROS here')")
+    command = [venv / "bin" / "python", "-m", "physai.play", "render=web", "web.port=0", "run=policy.pt"]
+    env = os.environ | {"PYTHONPATH": str(tmp_path / "without")}
+    process = subprocess.Popen(command, cwd=tmp_path, env=env, stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    said = next(line for line in process.stdout if "http" in line)
+    host, port = re.search(r"http://([\d.]+):(\d+)", said).groups()
+    visitor = Visitor(host, int(port))
+    wait_for(lambda: shows(visitor, "/robot/base"), 30.0, "a robot on the page")
+    visitor.close()
+    process.send_signal(signal.SIGINT)
+    assert process.wait(30) == 130
 
 
 def test_ros_finds_an_installed_wheel(venv):

@@ -1,8 +1,10 @@
 """A client of viser's pages that says whatever it likes, as no browser would."""
 
+import contextlib
 from typing import Any
 
 import msgspec
+import zstandard
 from viser import _messages
 
 from physai.bench.onlooker import look_at
@@ -41,3 +43,17 @@ class Visitor:
 
     def close(self) -> None:
         self.socket.close()
+
+
+def shows(visitor: Visitor, name: str) -> bool:
+    """Whether what has this name in the scene is among what the page sends now."""
+    with contextlib.suppress(TimeoutError):
+        while True:
+            if name.encode() in _unpacked(visitor.socket.recv(timeout=0.1)):
+                return True
+    return False
+
+
+def _unpacked(frame: Any) -> bytes:
+    size = int.from_bytes(frame[8:16], "little")
+    return zstandard.ZstdDecompressor().decompress(frame[16 : 16 + size])

@@ -17,7 +17,7 @@ from physai.ros.live.robots import Ask, Robots
 from physai.ros.live.status import Level, Status, stop_words
 from physai.web.door import Door, Visitor, commander
 
-_FRAMES = 20.0  # pictures a second
+_FRAMES = 15.0  # pictures a second
 _STATES, _WORDS, _PATHS, _SAMPLES, _PLOTS = 0.1, 0.3, 0.5, 0.5, 2.0  # s between two updates
 _MINUTES = 3
 _ASLEEP = 0.5  # s without a picture: then this program stood still, and what has waited for it is old

@@ -1,5 +1,6 @@
 """An emergency stop outlives the node: a file that is there says so."""
 
+import math
 import os
 import threading
 import time
@@ -7,7 +8,7 @@ from pathlib import Path
 
 from physai.files import sync_folder, write_atomically
 
-_DISK = 0.01  # s that a stop may wait for the disk, behind the zeros
+_DISK = 0.01  # s that who tells of a stop may wait for the disk
 _RETRY = 1.0  # s
 
 
@@ -40,7 +41,7 @@ class EmergencyStopFile:
             trial.unlink()
         except (OSError, RuntimeError) as error:  # RuntimeError: who has no home
             self.unusable = _why(error, self.path)
-        self._wanted = self.stopped
+        self._wanted, self._since = self.stopped, -math.inf
         self._synced: bool | None = self.stopped  # what the disk holds for sure; None: it may be either
         self._changed = threading.Condition()
         self._ended = False
@@ -50,11 +51,16 @@ class EmergencyStopFile:
     def remember(self) -> None:
         """Have the file made; does not wait for it."""
         with self._changed:
-            self._wanted = True
+            self._wanted, self._since = True, time.monotonic()
             self._changed.notify_all()
 
+    @property
+    def pending(self) -> bool:
+        """Whether the disk may still have it in time: who hears of a stop shall be able to rely on it."""
+        return self._synced != self._wanted and time.monotonic() - self._since < _DISK
+
     def wait(self) -> None:
-        """Wait a moment for what was wanted last, so that who hears of it next can rely on it."""
+        """Wait until nothing is pending."""
         with self._changed:
             self._changed.wait_for(lambda: self._synced == self._wanted, _DISK)
 
@@ -95,9 +101,8 @@ class EmergencyStopFile:
     def _write(self, stopped: bool) -> None:
         if stopped:
             self.path.parent.mkdir(parents=True, exist_ok=True)
-            with open(self.path, "w") as file:
-                file.write(f"emergency stop at {time.strftime('%Y-%m-%d %H:%M:%S')}, until ~/reset\n")
-                file.flush()
+            with open(self.path, "wb", 0) as file:
+                file.write(f"emergency stop at {time.strftime('%Y-%m-%d %H:%M:%S')}, until ~/reset\n".encode())
                 os.fsync(file.fileno())
         else:
             self.path.unlink(missing_ok=True)
