@@ -225,7 +225,7 @@ def test_a_simulation_that_is_not_finite_stops_the_run(tmp_path, monkeypatch):
 
     monkeypatch.setattr(Simulation, "reset", poisoned)
     with pytest.raises(UserError, match=r"iteration \d+: .*from the simulation is not finite"):
-        train_here(small_config(), tmp_path)
+        train_here(small_config("collector=single"), tmp_path)
     assert (tmp_path / "not_finite.pt").is_file()
 
 
