@@ -86,8 +86,7 @@ class InferenceNode(StoppableNode[InferenceConfig]):
         self._publishing = False  # whether this node has a say in what the arm does
         self._contested = False
         self._blocked: list[str] = []  # by interlocks
-        self._untold = False  # whether the state has changed since it was announced
-        self._stopped_by = ""
+        self._untold, self._stopped_by = False, ""  # whether the state has changed since it was announced; and by whom
         self._answered = -math.inf  # when a joint state was answered, for the last time
         self._timing = Timing()
         joints = config.joints or policy.metadata.joints
@@ -251,10 +250,8 @@ class InferenceNode(StoppableNode[InferenceConfig]):
                 self._controller.forget_goal()
                 self._goal = None
         self._contested = rival is not None
-        if (rivals := self._robot.rivals(now)) is not None:
-            found.append(rivals)
-        if self._imu is not None and (rivals := self._imu.rivals(now)) is not None:
-            found.append(rivals)
+        rivals = self._robot.rivals(now), self._imu.rivals(now) if self._imu is not None else None
+        found += filter(None, rivals)
         if (silence := self._commands.silence(now)) is not None:
             found.append(silence)
         if (unheard := self._commands.unheard) is not None:
@@ -347,6 +344,7 @@ class InferenceNode(StoppableNode[InferenceConfig]):
                 self._commands.finish()
         finally:
             self._stop_file.close(_DISK)
+        self._announce_changes()
 
 
 def _commands(node: InferenceNode, joints: int, quantity: Quantity, config: InferenceConfig) -> JointCommands:
