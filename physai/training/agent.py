@@ -65,11 +65,9 @@ class Agent:
         device = torch.device(config.device)
         if device.type == "cuda" and (device.index or 0) >= torch.cuda.device_count():
             raise UserError(f"device={config.device}: torch finds {torch.cuda.device_count()} GPUs here")
-        taught = {}
-        if "teacher" in config.algo:
-            from physai.training.teacher import load_teacher  # a trained policy, which is made of what is made here
+        from physai.training.earlier import load_pretrained, load_teacher  # policies, made of what is made here
 
-            taught["teacher"] = load_teacher(config)
+        taught = {"teacher": load_teacher(config)} if "teacher" in config.algo else {}
         torch.set_num_threads(config.threads)
         torch.manual_seed(derive(config.seed, "learner"))
         memory = config.memory_size
@@ -83,6 +81,9 @@ class Agent:
                 f"curriculum: nothing of randomization={config.randomization.name} has a range that can grow"
             )
         actor = make_actor(config, env).to(device)
+        statistics = RunningStatistics(env.normalizer, config.normalization.eps)
+        if config.pretrained is not None:
+            load_pretrained(config, actor, statistics)
         judged = Composite(**env.observation_spec, **env.full_action_spec, shape=env.batch_size)
         inputs = input_size(judged, config.policy.critic.get("in_keys"), "policy.critic")
         critic = make("policy.critic", config.policy.critic, needs=_NETWORK, in_features=inputs).to(device)
@@ -104,7 +105,6 @@ class Agent:
             algorithm.warmup_frames,
             device,
         )
-        statistics = RunningStatistics(env.normalizer, config.normalization.eps)
         return cls(env, statistics, actor, critic, algorithm, collector)
 
     def weights_sha256(self) -> str:
@@ -170,11 +170,10 @@ def make_actor(config: TrainConfig, env: TransformedRobotEnv) -> TensorDictModul
     return actor
 
 
-def load_policy_state(actor: TensorDictModuleBase, env: TransformedRobotEnv, state: dict[str, Any]) -> None:
-    """Give an actor its weights and an env its normalization statistics."""
+def load_policy_state(actor: TensorDictModuleBase, statistics: RunningStatistics, state: dict[str, Any]) -> None:
+    """Give an actor its weights, and an env's normalization its statistics."""
     try:
         actor.load_state_dict(state["actor"])
-        statistics = RunningStatistics(env.normalizer, eps=1.0)  # which no update asks for here
         statistics.load_state_dict(state["normalization"])
     except (RuntimeError, LookupError, TypeError, ValueError, AttributeError) as error:
         reason = (str(error) or type(error).__name__).splitlines()[0][:120]

@@ -25,7 +25,8 @@ EVALUATION_SEED = derive(0, "evaluation goals while training")  # the same goals
 class EvaluationCallback(Callback):
     """Evaluates the policy on the same goals every time, and keeps the best: by success, then settled, then return.
 
-    Its robots are made for the first evaluation: frames need not wait for them.
+    Its robots are made for the first evaluation: frames need not wait for them. A policy that was trained before is
+    evaluated before the first frame, too: it may be the best.
 
     Args:
         config: The run's.
@@ -44,20 +45,27 @@ class EvaluationCallback(Callback):
         self._best = [-1.0, 0.0, 0.0]
         self.best_frames = 0
 
+    def begin(self, trainer: Trainer) -> None:
+        """See :class:`Callback`."""
+        if self._config.pretrained is not None and not trainer.clock.frames:
+            self._evaluate_and_keep(trainer)
+
     def after_batch(self, trainer: Trainer, batch: TensorDictBase, values: dict[str, float]) -> None:
         """Evaluate, when it is time."""
-        if not trainer.due(self._config.evaluation.every_frames, batch):
-            return
-        with trainer.untimed():
-            result = self._evaluate(trainer)
-            settled = 0.0 if result.mean_error else result.settled_rate  # where goals change, nobody stays at one
-            score = [result.success_rate, settled, float(result.episode_return.mean())]
-            if score >= self._best or not trainer.folder.best.is_file():
-                self._best, self.best_frames = score, trainer.clock.frames
-                content = {"frames": trainer.clock.frames, **trainer.agent.policy_state()}
-                checkpoint.save(trainer.folder.best, content)
-        summary = result.summary().items()
-        values |= {f"evaluation/{key}": value for key, value in summary if isinstance(value, float)}
+        if trainer.due(self._config.evaluation.every_frames, batch):
+            with trainer.untimed():
+                summary = self._evaluate_and_keep(trainer).summary().items()
+            values |= {f"evaluation/{key}": value for key, value in summary if isinstance(value, float)}
+
+    def _evaluate_and_keep(self, trainer: Trainer) -> Evaluation:
+        result = self._evaluate(trainer)
+        settled = 0.0 if result.mean_error else result.settled_rate  # where goals change, nobody stays at one
+        score = [result.success_rate, settled, float(result.episode_return.mean())]
+        if score >= self._best or not trainer.folder.best.is_file():
+            self._best, self.best_frames = score, trainer.clock.frames
+            content = {"frames": trainer.clock.frames, **trainer.agent.policy_state()}
+            checkpoint.save(trainer.folder.best, content)
+        return result
 
     def _evaluate(self, trainer: Trainer) -> Evaluation:
         goals = self._config.evaluation.goals

@@ -110,6 +110,7 @@ class TrainConfig(Config):
     logger: Target
     seed: Seed
     total_frames: Count
+    pretrained: str | None
     device: Annotated[str, Field(pattern=r"^(cpu|cuda(:\d+)?)$")]
     threads: Count
     resume: None  # the command takes it before a config is made

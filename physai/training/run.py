@@ -37,6 +37,7 @@ from physai.training.evaluation import (
 )
 from physai.training.stopping import end_stopped, stop_signals
 from physai.training.trainer import Trainer
+from physai.transforms import RunningStatistics
 
 FINAL_SEED = derive(0, "final evaluation goals")
 
@@ -88,7 +89,9 @@ def run_training(
         except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
             raise UserError(f"{done}: the run's summary is damaged") from error
         return summary
-    agent = agent or Agent.build(config)
+    if agent is None:
+        goes_on = resume and any(run_dir.glob("checkpoints/*.pt"))  # what it had begun with lies there, too
+        agent = Agent.build(config.model_copy(update={"pretrained": None}) if goes_on else config)
     with contextlib.closing(agent), stop_signals() as stop:
         for doubt in agent.env.simulation.spec.doubtful:
             print(doubt)
@@ -200,11 +203,15 @@ class TrainedPolicy:
         env = make_evaluation_env(config, randomization or self.randomization, num_envs, seed)
         try:
             actor = make_actor(config, env)
-            load_policy_state(actor, env, self._state)
+            self.load_into(actor, RunningStatistics(env.normalizer, eps=1.0))  # which no update asks for here
         except BaseException:
             env.close()
             raise
         return actor, env
+
+    def load_into(self, actor: TensorDictModuleBase, statistics: RunningStatistics) -> None:
+        """Give an actor its weights, and an env's normalization the statistics that it was trained with."""
+        load_policy_state(actor, statistics, self._state)
 
     def evaluate(self, episodes: int, seed: int = FINAL_SEED) -> Evaluation:
         """Evaluate it on so many goals."""

@@ -84,7 +84,7 @@ def test_a_teacher_that_is_not_there_or_knows_another_robot_or_remembers_is_refu
 ):
     for teacher, others, line in (
         (tmp_path, (), f"algo.teacher: {tmp_path}: no run there (it has no .hydra/config.yaml)"),
-        (5, (), "algo.teacher: the run folder of a teacher is needed, got 5"),
+        (5, (), "algo.teacher: a run folder is needed, got 5"),
         (teacher_run, ("env=kuka_reacher",), f"algo.teacher: {teacher_run} knows 'reacher', and 'kuka_reacher' has "
          "another env.robot"),
         (teacher_run, ("env.control_dt=0.01",), f"algo.teacher: {teacher_run} knows 'reacher', and 'reacher' has "

@@ -1,0 +1,70 @@
+"""A run begins with the best policy of another, and needs that one no more once it has begun."""
+
+import json
+import re
+import shutil
+from contextlib import closing
+
+import pytest
+import torch
+
+from physai.errors import UserError
+from physai.training import checkpoint
+from physai.training.agent import Agent
+from tests.training.small import SMALL, TINY, assert_same_run, forget_after, resume_here, run_here, small_config
+
+
+def best_of(run):
+    return checkpoint.load(run / "checkpoints" / "best.pt")
+
+
+def test_it_begins_with_weights_and_statistics_and_with_a_critic_of_its_own(exported_run):
+    critic = "policy.critic.in_keys=[normalized_observation,features,relative_parameters]"
+    with closing(Agent.build(small_config(f"pretrained={exported_run}", critic))) as agent:
+        begun, trained = agent.policy_state(), best_of(exported_run)
+    for part in ("actor", "normalization"):
+        assert begun[part].keys() == trained[part].keys()
+        assert all(torch.equal(value, trained[part][key]) for key, value in begun[part].items())
+
+
+@pytest.mark.parametrize("collector", ["single", "async"])
+def test_robots_act_by_it_from_the_first_frame_on_in_the_collectors_processes_too(exported_run, collector):
+    config = small_config(f"pretrained={exported_run}", f"collector={collector}", "collector.num_envs=32")
+    with closing(Agent.build(config)) as agent:
+        batch = next(iter(agent.collector))
+        assert torch.equal(agent.env.normalizer(batch["observation"]), batch["normalized_observation"])
+        probability = agent.actor.get_dist(batch).log_prob(batch["latent_action"])
+        torch.testing.assert_close(probability, batch["action_log_prob"])
+
+
+def test_what_it_began_with_stays_the_best_if_learning_only_harms_it(exported_run, tmp_path):
+    run_here(tmp_path / "run", *TINY, f"pretrained={exported_run}", "algo.optimizer.lr=1.0", "env.task.max_steps=150")
+    kept, trained = best_of(tmp_path / "run"), best_of(exported_run)
+    assert all(torch.equal(value, trained["actor"][key]) for key, value in kept["actor"].items())
+    assert kept["frames"] == json.loads((tmp_path / "run" / "summary.json").read_text())["best_frames"] == 0
+
+
+@pytest.mark.slow
+def test_it_goes_on_bit_for_bit_after_the_other_run_is_gone(exported_run, tmp_path):
+    shutil.copytree(exported_run, tmp_path / "other")
+    run_here(tmp_path / "whole", *SMALL, f"pretrained={tmp_path / 'other'}")
+    shutil.rmtree(tmp_path / "other")
+    shutil.copytree(tmp_path / "whole", tmp_path / "run")
+    forget_after(tmp_path / "run", 14336)
+    resume_here(tmp_path / "run")
+    assert_same_run(tmp_path / "run", tmp_path / "whole")
+
+
+def test_a_policy_that_does_not_fit_is_refused_in_one_line(exported_run, tmp_path):
+    for given, line in (
+        ((f"pretrained={tmp_path}",), f"pretrained: {tmp_path}: no run there (it has no .hydra/config.yaml)"),
+        ((f"pretrained={exported_run}", "env=kuka_reacher"),
+         f"pretrained: {exported_run} knows 'reacher', and 'kuka_reacher' has another env.robot"),
+        ((f"pretrained={exported_run}", "policy.actor.hidden_sizes=[32]"),
+         f"pretrained: the policy of {exported_run} has policy.actor.hidden_sizes=[64, 64]"),
+        ((f"pretrained={exported_run}", "policy=history"),
+         f"pretrained: the policy of {exported_run} has policy.actor._target_=physai.policies.GaussianActor, "
+         "policy.actor.past_actions=None"),
+    ):  # fmt: skip
+        with pytest.raises(UserError, match=f"^{re.escape(line)}$"):
+            Agent.build(small_config(*given))
