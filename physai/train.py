@@ -88,8 +88,12 @@ class Training:
 
     def train(self, node: DictConfig, run_dir: Path) -> None:
         """Train, and export the best policy."""
+        from physai.training.run import run_training
+
         agent, self._agent = self._agent, None
-        _train(_config(node), run_dir, _watching(node), agent=agent)
+        config, shown = _config(node), _watching(node)
+        with _drawn_and_exported(config, run_dir), _page(config, shown) as watch:
+            run_training(config, run_dir, agent=agent, watch=watch)
 
     def close(self) -> None:
         """Free what ``train`` did not take."""
@@ -102,7 +106,7 @@ class Training:
 def _resume(run_dir: Path, given: list[str]) -> None:
     from physai import foreign
     from physai.compose import compose
-    from physai.training.run import load_config
+    from physai.training.run import load_config, run_training
 
     if _sweeps():
         raise UserError("resume continues one run; it cannot be swept over")
@@ -121,7 +125,9 @@ def _resume(run_dir: Path, given: list[str]) -> None:
                 difference = f"{'.'.join(map(str, key))}={old}, not {new}"
                 raise UserError(f"resume={run_dir}: the run has {difference}; a resumed run keeps its config")
     shown = [override for override in given if override.split("=")[0].split(".")[0] in ("render", "web")]
-    _train(config, run_dir, _watching(compose("train", shown)), resume=True)
+    watching = _watching(compose("train", shown))
+    with _drawn_and_exported(config, run_dir), _page(config, watching) as watch:
+        run_training(config, run_dir, resume=True, watch=watch)
 
 
 def _allowed(override: str) -> list[str]:
@@ -135,15 +141,11 @@ def _allowed(override: str) -> list[str]:
     return validate(Allowed, OmegaConf.masked_copy(compose("train", [override]), ["allow"])).allow
 
 
-def _train(
-    config: "TrainConfig", run_dir: Path, shown: "WatchConfig", resume: bool = False, agent: "Agent | None" = None
-) -> None:
-    """Train, draw the run, and export its policy."""
-    from physai.training.run import run_training
-
+@contextlib.contextmanager
+def _drawn_and_exported(config: "TrainConfig", run_dir: Path) -> "Iterator[None]":
+    """Context of a training; then the run is drawn, and its policy exported."""
     complete = (run_dir / "summary.json").is_file()
-    with _page(config, shown) as watch:
-        run_training(config, run_dir, resume, agent, watch)
+    yield
     if not (complete and (run_dir / "training.png").is_file()):
         _draw(config, run_dir)
     _export(config, run_dir, complete)

@@ -179,7 +179,8 @@ def test_a_run_of_ones_own_parts_is_judged_and_exported_where_it_was_trained(own
     monkeypatch.setattr(artifact, "export_policy", export)
     config = validate(TrainConfig, compose("train", [*TINY, EXPORTED, "env.task._target_=mypackage.Mine"]))
     unseen = WatchConfig(render=None, web=PageConfig(host="127.0.0.1", port=0))
-    train._train(config, own, unseen, resume=True)
+    with train._drawn_and_exported(config, own), train._page(config, unseen) as watch:
+        run_training(config, own, resume=True, watch=watch)
     assert (own / "summary.json").is_file()
     assert exported == [config]
 

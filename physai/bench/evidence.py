@@ -1,4 +1,4 @@
-"""What it is worth to know one's robot: policies trained in six ways, on robots that differ from its description.
+"""What it is worth to know one's robot: policies trained in seven ways, on robots that differ from its description.
 
 They learn in PyBullet, whose motors bring all joints to their velocities together; or in MuJoCo with drives, each of
 which pulls at its own joint. The hidden robots live there, have drives and rotors, and respond late.
@@ -52,7 +52,8 @@ WAYS = {
         *("curriculum.results=8", "curriculum.step=0.15", "curriculum.narrow_below=0.8"),  # docs/curriculum.md
     ),
 }
-ADAPTIVE, IDENTIFIED = "adaptive, drives", "identified, drives"
+ADAPTIVE, TUNED, IDENTIFIED = "adaptive, drives", "the same, fine-tuned", "identified, drives"
+KNOWING = "normalized_observation,features,relative_parameters,past_actions"  # a critic sees what its actor does not
 DONE = "summary.json"  # which a run writes last
 
 
@@ -64,6 +65,7 @@ class Arm:
         taught: Overrides.
         teaches: Those of teachers, besides.
         learns: Those of students.
+        tunes: Those of students that go on with PPO.
         rotor: What training with drives, and identification, take its rotors for; kg m².
         rotors: What the hidden ones have, at least and at most, kg m².
         feels: Whether its joints tell their efforts. It then need not bring motors to their limits to be known, and
@@ -73,6 +75,7 @@ class Arm:
     taught: tuple[str, ...]
     teaches: tuple[str, ...]
     learns: tuple[str, ...]
+    tunes: tuple[str, ...]
     rotor: float
     rotors: tuple[float, float]
     feels: bool
@@ -97,7 +100,15 @@ class Arm:
 
 
 ARMS = {
-    "reacher": Arm(("experiment=settle",), (), ("experiment=settle_student",), 0.0, (0.005, 0.02), feels=False),
+    "reacher": Arm(
+        ("experiment=settle",),
+        (),
+        ("experiment=settle_student",),
+        ("experiment=settle_finetune", "policy=gru"),
+        0.0,
+        (0.005, 0.02),
+        feels=False,
+    ),
     # MuJoCo Menagerie gives each joint of this arm a rotor of 0.1 kg m²; and the real one measures torques. A teacher
     # that is told 50 parameters moves too far in each small batch.
     "kuka7_reach": Arm(
@@ -107,6 +118,7 @@ ARMS = {
             *("algo.minibatch_size=1024", "total_frames=1_200_000"),
         ),
         ("total_frames=600_000",),
+        ("policy=gru", "algo.optimizer.lr=3e-4", f"policy.critic.in_keys=[{KNOWING}]", "total_frames=300_000"),
         0.1,
         (0.05, 0.2),
         feels=True,
@@ -222,14 +234,16 @@ def _train_all(
     """
     common = (f"env={arm}", f"seed={seed}", "export.formats=[]", "evaluation.in_a_row=0", *overrides)
     known = ARMS[arm]
-    taught, learns = ((*common, *each) for each in (known.taught, known.learns))
+    taught, learns, tunes = ((*common, *each) for each in (known.taught, known.learns, known.tunes))
     for way, changes in WAYS.items():
         drives = known.drives if way == DRIVES else ()
         yield way, [_train(folder / way.replace(", ", "_"), *taught, *changes, *drives)]
     among = (*STRONG, *known.drives)
     teacher = _train(folder / "teacher", *taught, *known.teaches, *among, "policy=privileged")
     taught_by = "algo=distill", f"algo.teacher={teacher}"
-    yield ADAPTIVE, [_train(folder / "adaptive", *learns, *among, *taught_by, after=teacher / DONE)]
+    student = _train(folder / "adaptive", *learns, *among, *taught_by, after=teacher / DONE)
+    yield ADAPTIVE, [student]
+    yield TUNED, [_train(folder / "tuned", *tunes, *among, f"pretrained={student}", after=student / DONE)]
     own = []
     for recording in recordings:
         result = recording.with_suffix("") / "identified.yaml"
