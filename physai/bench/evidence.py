@@ -53,7 +53,6 @@ WAYS = {
     ),
 }
 ADAPTIVE, TUNED, IDENTIFIED = "adaptive, drives", "the same, fine-tuned", "identified, drives"
-KNOWING = "normalized_observation,features,relative_parameters,past_actions"  # a critic sees what its actor does not
 DONE = "summary.json"  # which a run writes last
 
 
@@ -63,7 +62,6 @@ class Arm:
 
     Attributes:
         taught: Overrides.
-        teaches: Those of teachers, besides.
         learns: Those of students.
         tunes: Those of students that go on with PPO.
         rotor: What training with drives, and identification, take its rotors for; kg m².
@@ -73,7 +71,6 @@ class Arm:
     """
 
     taught: tuple[str, ...]
-    teaches: tuple[str, ...]
     learns: tuple[str, ...]
     tunes: tuple[str, ...]
     rotor: float
@@ -102,23 +99,17 @@ class Arm:
 ARMS = {
     "reacher": Arm(
         ("experiment=settle",),
-        (),
         ("experiment=settle_student",),
         ("experiment=settle_finetune", "policy=gru"),
         0.0,
         (0.005, 0.02),
         feels=False,
     ),
-    # MuJoCo Menagerie gives each joint of this arm a rotor of 0.1 kg m²; and the real one measures torques. A teacher
-    # that is told 50 parameters moves too far in each small batch.
+    # MuJoCo Menagerie gives each joint of this arm a rotor of 0.1 kg m²; and the real one measures torques.
     "kuka7_reach": Arm(
         (),
-        (
-            *("collector=single", "collector.num_envs=512", "collector.frames_per_batch=8192"),
-            *("algo.minibatch_size=1024", "total_frames=1_200_000"),
-        ),
         ("total_frames=600_000",),
-        ("policy=gru", "algo.optimizer.lr=3e-4", f"policy.critic.in_keys=[{KNOWING}]", "total_frames=300_000"),
+        ("policy=gru", "algo.optimizer.lr=3e-4", "total_frames=300_000"),
         0.1,
         (0.05, 0.2),
         feels=True,
@@ -239,7 +230,7 @@ def _train_all(
         drives = known.drives if way == DRIVES else ()
         yield way, [_train(folder / way.replace(", ", "_"), *taught, *changes, *drives)]
     among = (*STRONG, *known.drives)
-    teacher = _train(folder / "teacher", *taught, *known.teaches, *among, "policy=privileged")
+    teacher = _train(folder / "teacher", *taught, *among, "policy=privileged")
     taught_by = "algo=distill", f"algo.teacher={teacher}"
     student = _train(folder / "adaptive", *learns, *among, *taught_by, after=teacher / DONE)
     yield ADAPTIVE, [student]
