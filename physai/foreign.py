@@ -99,7 +99,7 @@ def read_config(
         run_dir: The run folder.
         allow: Packages whose classes and functions the config may name, too.
         given: The user's overrides of ``conf/train.yaml``.
-        resume: Whether the run will go on: the config may then name no place outside of the run folder.
+        resume: Whether the run will go on: the config may then name no place outside of the run folder to write to.
 
     Returns:
         Plain values, without interpolations.

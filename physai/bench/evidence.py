@@ -23,6 +23,7 @@ from torch import Tensor
 from physai.bench.hidden import draw, record, write_table
 from physai.bench.identify import DRIVE, SECONDS, UNKNOWNS
 from physai.bench.timing import config_of, table
+from physai.compose import compose
 from physai.envs.simulation import EnvConfig
 from physai.errors import UserError
 from physai.files import write_atomically
@@ -52,7 +53,7 @@ WAYS = {
         *("curriculum.results=8", "curriculum.step=0.15", "curriculum.narrow_below=0.8"),  # docs/curriculum.md
     ),
 }
-ADAPTIVE, TUNED, IDENTIFIED = "adaptive, drives", "the same, fine-tuned", "identified, drives"
+ADAPTIVE, TUNED, IDENTIFIED = "adaptive, drives", "adaptive, fine-tuned", "identified, drives"
 DONE = "summary.json"  # which a run writes last
 
 
@@ -109,7 +110,7 @@ ARMS = {
     "kuka7_reach": Arm(
         (),
         ("total_frames=600_000",),
-        ("policy=gru", "algo.optimizer.lr=3e-4", "total_frames=300_000"),
+        ("policy=gru", "total_frames=300_000", "evaluation.goals=1000"),
         0.1,
         (0.05, 0.2),
         feels=True,
@@ -251,9 +252,9 @@ def _train_all(
 
 
 def _train(folder: Path, *overrides: str, after: Path | None = None) -> Path:
-    """Train, unless it was done with these overrides, and after what a run depends on was written."""
-    said, done = folder / ".hydra" / "overrides.yaml", folder / DONE
-    same = said.is_file() and OmegaConf.load(said) == list(overrides) and done.is_file()
+    """Train, unless it was done with this config, and after what a run depends on was written."""
+    said, done = folder / ".hydra" / "config.yaml", folder / DONE
+    same = said.is_file() and done.is_file() and OmegaConf.load(said) == compose("train", overrides)
     if not same or (after is not None and done.stat().st_mtime < after.stat().st_mtime):
         shutil.rmtree(folder, ignore_errors=True)
         _command("train", *overrides, f"hydra.run.dir={folder}")

@@ -68,13 +68,13 @@ def plain_ppo(agent: Agent, batch: TensorDictBase, algo: dict[str, Any]) -> Call
     parameters = [*actor.parameters(), *critic.parameters()]
     optimizer = torch.optim.Adam(parameters, lr=lr, eps=1e-5, fused=True)
 
-    def inputs(frames: TensorDictBase) -> Tensor:
-        return torch.cat([frames.get(key) for key in actor.in_keys], -1)
+    def inputs(frames: TensorDictBase, of: Any) -> Tensor:
+        return torch.cat([frames.get(key) for key in of.in_keys], -1)
 
     def advantages(seen: Tensor) -> tuple[Tensor, Tensor]:
         after = batch.get("next")
         reward, done, terminated = (after.get(key)[..., 0] for key in ("reward", "done", "terminated"))
-        value, next_value = critic.network(seen)[..., 0], critic.network(inputs(after))[..., 0]
+        value, next_value = critic.network(seen)[..., 0], critic.network(inputs(after, critic))[..., 0]
         delta = reward + gamma * next_value * ~terminated - value
         advantage, running = torch.empty_like(delta), torch.zeros(len(delta))
         for step in reversed(range(delta.shape[1])):
@@ -84,17 +84,18 @@ def plain_ppo(agent: Agent, batch: TensorDictBase, algo: dict[str, Any]) -> Call
 
     def update() -> int:
         with torch.no_grad():
-            seen = inputs(batch)
-            columns = [seen, batch.get("latent_action"), batch.get("action_log_prob"), *advantages(seen)]
+            judged = inputs(batch, critic)
+            acted = inputs(batch, actor), batch.get("latent_action"), batch.get("action_log_prob")
+            columns = [*acted, judged, *advantages(judged)]
         frames = [column.flatten(0, 1) for column in columns]
         for _ in range(algo["epochs"]):
             for rows in torch.randperm(batch.numel()).split(algo["minibatch_size"]):
-                seen, latent, old, advantage, target = (column[rows] for column in frames)
+                seen, latent, old, judged, advantage, target = (column[rows] for column in frames)
                 advantage = (advantage - advantage.mean()) / (advantage.std() + 1e-8)
                 normal = torch.distributions.Normal(actor.network(seen), actor.log_std.exp(), validate_args=False)
                 ratio = (normal.log_prob(latent).sum(-1) - old).exp()
                 gain = torch.min(ratio * advantage, ratio.clamp(1 - clip, 1 + clip) * advantage).mean()
-                error = (critic.network(seen)[..., 0] - target).square().mean()
+                error = (critic.network(judged)[..., 0] - target).square().mean()
                 optimizer.zero_grad()
                 (critic_coeff * error - gain).backward()
                 nn.utils.clip_grad_norm_(parameters, algo["max_grad_norm"])

@@ -23,7 +23,9 @@ EVALUATION_SEED = derive(0, "evaluation goals while training")  # the same goals
 
 
 class EvaluationCallback(Callback):
-    """Evaluates the policy on the same goals every time, and keeps the best: by success, then settled, then return.
+    """Evaluates the policy on the same goals every time, and keeps the best: by success and settled, then by return.
+
+    The two rates count alike: among policies that reach nearly all goals, who reaches one more is chance.
 
     Its robots are made for the first evaluation: frames need not wait for them. A policy that was trained before is
     evaluated before the first frame, too: it may be the best.
@@ -42,13 +44,14 @@ class EvaluationCallback(Callback):
         self._config = config
         self._watch = watch
         self._env: TransformedRobotEnv | None = None
-        self._best = [-1.0, 0.0, 0.0]
+        self._best = [-1.0, 0.0]
         self.best_frames = 0
 
     def begin(self, trainer: Trainer) -> None:
         """See :class:`Callback`."""
         if self._config.pretrained is not None and not trainer.clock.frames:
-            self._evaluate_and_keep(trainer)
+            rate = self._evaluate_and_keep(trainer).success_rate
+            print(f"It begins with the policy of {self._config.pretrained}: success {rate:.1%}", flush=True)
 
     def after_batch(self, trainer: Trainer, batch: TensorDictBase, values: dict[str, float]) -> None:
         """Evaluate, when it is time."""
@@ -60,7 +63,7 @@ class EvaluationCallback(Callback):
     def _evaluate_and_keep(self, trainer: Trainer) -> Evaluation:
         result = self._evaluate(trainer)
         settled = 0.0 if result.mean_error else result.settled_rate  # where goals change, nobody stays at one
-        score = [result.success_rate, settled, float(result.episode_return.mean())]
+        score = [result.success_rate + settled, float(result.episode_return.mean())]
         if score >= self._best or not trainer.folder.best.is_file():
             self._best, self.best_frames = score, trainer.clock.frames
             content = {"frames": trainer.clock.frames, **trainer.agent.policy_state()}

@@ -1,5 +1,6 @@
 """Policies of earlier runs that a run needs: one to go on with, or a teacher."""
 
+from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
 
@@ -12,8 +13,8 @@ from physai.training.config import TrainConfig
 from physai.training.run import TrainedPolicy, load_config
 from physai.transforms import RunningStatistics
 
-_SAME = ("robot", "control_dt")
-_FREE = ("initial_std", "exploration_std")  # arguments of actors that leave their networks as they are
+_EXPLORING = ("initial_std", "exploration_std")  # arguments of actors that leave their networks as they are
+_DYNAMICS = ("damping", "friction", "armature", "gravity", "inertials")  # what a policy may learn anew
 
 
 def load_pretrained(config: TrainConfig, actor: TensorDictModuleBase, statistics: RunningStatistics) -> None:
@@ -27,14 +28,18 @@ def load_pretrained(config: TrainConfig, actor: TensorDictModuleBase, statistics
     Raises:
         UserError: If there is no such policy, it is of another robot, control rate or task, or of another shape.
     """
-    trained = _trained(config, config.pretrained, "pretrained")
+    trained = _trained(config, config.pretrained, "pretrained", _DYNAMICS)
     own, theirs = config.policy.actor, trained.config.policy.actor
-    keys = sorted({*own, *theirs} - {*_FREE})
-    different = [f"policy.actor.{key}" for key in keys if own.get(key) != theirs.get(key)]
-    if different:
-        named = ", ".join(f"{key}={theirs.get(key.rpartition('.')[2])}" for key in different)
-        raise UserError(f"pretrained: the policy of {config.pretrained} has {named}")
-    trained.load_into(actor, statistics)
+    keys = sorted(key for key in {*own, *theirs} - {*_EXPLORING} if own.get(key) != theirs.get(key))
+    has = [f"policy.actor.{key}={theirs[key]}" if key in theirs else f"no policy.actor.{key}" for key in keys]
+    if config.normalization != trained.config.normalization:
+        has.append("another normalization")
+    if has:
+        raise UserError(f"pretrained: the policy of {config.pretrained} has {', '.join(has)}")
+    try:
+        trained.load_into(actor, statistics)
+    except UserError as error:
+        raise UserError(f"pretrained: {error}") from error
 
 
 def load_teacher(config: TrainConfig) -> Teacher:
@@ -59,8 +64,8 @@ def load_teacher(config: TrainConfig) -> Teacher:
         return Teacher(actor, env.normalizer)
 
 
-def _trained(config: TrainConfig, where: object, key: str) -> TrainedPolicy:
-    """Read the best policy of the run that ``key`` names, which must know the robot and the task."""
+def _trained(config: TrainConfig, where: object, key: str, free: Sequence[str] = ()) -> TrainedPolicy:
+    """Read the best policy of the run that ``key`` names, which must know the task, and the robot but for what is free."""
     if not isinstance(where, str):
         raise UserError(f"{key}: a run folder is needed, got {where!r}")
     run_dir = Path(where)
@@ -69,7 +74,11 @@ def _trained(config: TrainConfig, where: object, key: str) -> TrainedPolicy:
     except UserError as error:
         raise UserError(f"{key}: {error}") from error
     own, theirs = config.env, trained.config.env
-    different = [f"env.{name}" for name in _SAME if getattr(own, name) != getattr(theirs, name)]
+    robots = own.robot.model_dump(exclude={*free}), theirs.robot.model_dump(exclude={*free})
+    names = [name for name, value in robots[0].items() if value != robots[1][name]]
+    different = ["env.robot"] if "name" in names else [f"env.robot.{name}" for name in names]
+    if own.control_dt != theirs.control_dt:
+        different.append("env.control_dt")
     if own.task["_target_"] != theirs.task["_target_"]:
         different.append("env.task._target_")
     if different:

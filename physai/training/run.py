@@ -90,8 +90,8 @@ def run_training(
             raise UserError(f"{done}: the run's summary is damaged") from error
         return summary
     if agent is None:
-        goes_on = resume and any(run_dir.glob("checkpoints/*.pt"))  # what it had begun with lies there, too
-        agent = Agent.build(config.model_copy(update={"pretrained": None}) if goes_on else config)
+        goes_on = resume and checkpoint.CheckpointFolder(run_dir / "checkpoints", config.checkpoint.keep).paths()
+        agent = Agent.build(config.model_copy(update={"pretrained": None}) if goes_on else config)  # it lies there, too
     with contextlib.closing(agent), stop_signals() as stop:
         for doubt in agent.env.simulation.spec.doubtful:
             print(doubt)

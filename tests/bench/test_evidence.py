@@ -44,7 +44,7 @@ def test_every_way_is_judged_on_every_kind_of_robot_and_a_run_that_lies_there_is
     monkeypatch.setattr(evidence, "_command", as_if)
     found = evidence.measure_evidence(0, 1, tmp_path, ("reacher",), TINY)
     assert trained == ["default", "teacher", "adaptive", "tuned", "reacher_robot0", "reacher_robot1"]
-    assert list(found["reacher"]) == ["default", "adaptive, drives", "the same, fine-tuned", "identified, drives"]
+    assert list(found["reacher"]) == ["default", "adaptive, drives", "adaptive, fine-tuned", "identified, drives"]
     for shown in (each for ways in found["reacher"].values() for each in ways):
         assert [len(judged.settled) for judged in shown.on.values()] == [1, 3, 2]
         assert all(0 <= rate <= 1 for judged in shown.on.values() for rate in (*judged.success, *judged.settled))

@@ -20,8 +20,10 @@ def best_of(run):
 
 def test_it_begins_with_weights_and_statistics_and_with_a_critic_of_its_own(exported_run):
     critic = "policy.critic.in_keys=[normalized_observation,features,relative_parameters]"
-    with closing(Agent.build(small_config(f"pretrained={exported_run}", critic))) as agent:
+    rotors = "physics=mujoco", "physics.motor=servo", "env.robot.armature=0.01"  # which the other run knows nothing of
+    with closing(Agent.build(small_config(f"pretrained={exported_run}", critic, *rotors))) as agent:
         begun, trained = agent.policy_state(), best_of(exported_run)
+        assert "relative_parameters" in agent.critic.in_keys
     for part in ("actor", "normalization"):
         assert begun[part].keys() == trained[part].keys()
         assert all(torch.equal(value, trained[part][key]) for key, value in begun[part].items())
@@ -44,6 +46,17 @@ def test_what_it_began_with_stays_the_best_if_learning_only_harms_it(exported_ru
     assert kept["frames"] == json.loads((tmp_path / "run" / "summary.json").read_text())["best_frames"] == 0
 
 
+def test_a_run_that_was_killed_before_its_first_checkpoint_begins_with_it_again(exported_run, tmp_path):
+    run_here(tmp_path / "run", *TINY, f"pretrained={exported_run}", "env.task.max_steps=150")
+    whole = tmp_path / "whole"
+    shutil.copytree(tmp_path / "run", whole)
+    forget_after(tmp_path / "run", -1)
+    (tmp_path / "run" / "metrics.csv").unlink()
+    shutil.copy(whole / "checkpoints" / "best.pt", tmp_path / "run" / "checkpoints")  # which is written first
+    resume_here(tmp_path / "run")
+    assert_same_run(tmp_path / "run", whole)
+
+
 @pytest.mark.slow
 def test_it_goes_on_bit_for_bit_after_the_other_run_is_gone(exported_run, tmp_path):
     shutil.copytree(exported_run, tmp_path / "other")
@@ -60,11 +73,16 @@ def test_a_policy_that_does_not_fit_is_refused_in_one_line(exported_run, tmp_pat
         ((f"pretrained={tmp_path}",), f"pretrained: {tmp_path}: no run there (it has no .hydra/config.yaml)"),
         ((f"pretrained={exported_run}", "env=kuka_reacher"),
          f"pretrained: {exported_run} knows 'reacher', and 'kuka_reacher' has another env.robot"),
+        ((f"pretrained={exported_run}", "env.robot.command_limit=1.5", "env.control_dt=0.01"),
+         f"pretrained: {exported_run} knows 'reacher', and 'reacher' has another env.robot.command_limit and "
+         "env.control_dt"),
+        ((f"pretrained={exported_run}", "normalization.clip=5"),
+         f"pretrained: the policy of {exported_run} has another normalization"),
         ((f"pretrained={exported_run}", "policy.actor.hidden_sizes=[32]"),
          f"pretrained: the policy of {exported_run} has policy.actor.hidden_sizes=[64, 64]"),
         ((f"pretrained={exported_run}", "policy=history"),
          f"pretrained: the policy of {exported_run} has policy.actor._target_=physai.policies.GaussianActor, "
-         "policy.actor.past_actions=None"),
+         "no policy.actor.past_actions"),
     ):  # fmt: skip
         with pytest.raises(UserError, match=f"^{re.escape(line)}$"):
             Agent.build(small_config(*given))
