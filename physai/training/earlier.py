@@ -65,7 +65,7 @@ def load_teacher(config: TrainConfig) -> Teacher:
 
 
 def _trained(config: TrainConfig, where: object, key: str, free: Sequence[str] = ()) -> TrainedPolicy:
-    """Read the best policy of the run that ``key`` names, which must know the task, and the robot but for what is free."""
+    """Read the best policy of the run that ``key`` names; it must know the task, and the robot but for what is free."""
     if not isinstance(where, str):
         raise UserError(f"{key}: a run folder is needed, got {where!r}")
     run_dir = Path(where)
