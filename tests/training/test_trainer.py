@@ -4,6 +4,7 @@ import json
 import os
 import signal
 import time
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -172,6 +173,20 @@ def test_after_a_resume_a_policy_worse_than_the_best_before_does_not_take_its_pl
     evaluation.after_batch(trainer, batch, {})
     assert trainer.folder.best.read_bytes() == best
     assert evaluation.state() == {"best": [1.0, 1000.0], "best_frames": 7}
+
+
+@pytest.mark.slow
+def test_a_policy_that_stays_at_more_goals_is_better_although_it_missed_one(evaluating, monkeypatch):
+    trainer, evaluation = evaluating()
+    kept = []
+    for number, (success, settled) in enumerate([(1.0, 0.94), (0.995, 0.99), (1.0, 0.9)]):
+        result = SimpleNamespace(success_rate=success, settled_rate=settled, mean_error={}, summary=dict)
+        result.episode_return = torch.zeros(1)
+        monkeypatch.setattr(evaluation, "_evaluate", lambda _, result=result: result)
+        trainer.clock.frames = trainer.total_frames + number
+        evaluation.after_batch(trainer, torch.zeros(16, 64), {})
+        kept.append(evaluation.best_frames - trainer.total_frames)
+    assert kept == [0, 1, 1]
 
 
 @pytest.mark.slow
