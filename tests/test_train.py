@@ -62,7 +62,7 @@ def training(monkeypatch):
     """The command, which notes what it would train instead of training it."""
     trained = []
     monkeypatch.setattr(
-        "physai.training.run.run_training", lambda config, run_dir, resume, agent, watch: trained.append(agent)
+        "physai.training.run.run_training", lambda config, run_dir, agent, watch: trained.append(agent)
     )
     commands = []
 
