@@ -61,9 +61,7 @@ def test_before_the_first_frame_nothing_is_built_twice_and_nothing_imported_that
 def training(monkeypatch):
     """The command, which notes what it would train instead of training it."""
     trained = []
-    monkeypatch.setattr(
-        "physai.training.run.run_training", lambda config, run_dir, agent, watch: trained.append(agent)
-    )
+    monkeypatch.setattr("physai.training.run.run_training", lambda config, run_dir, agent, watch: trained.append(agent))
     commands = []
 
     def make(keep):
