@@ -8,6 +8,7 @@ import time
 import pytest
 
 from tests.training.small import TINY, command
+from tests.waiting import wait_while_runs
 
 SWEEP = ("-m", *TINY, "hydra.sweep.dir=sweep")
 
@@ -18,14 +19,6 @@ def run(*arguments, cwd):
     process = command("train", *SWEEP, *arguments, cwd=cwd)
     output = process.communicate()[0]
     return process.returncode, output
-
-
-def wait_until(condition, process, seconds=240):
-    deadline = time.monotonic() + seconds
-    while not condition():
-        assert process.poll() is None, process.communicate()[0]
-        assert time.monotonic() < deadline
-        time.sleep(0.05)
 
 
 def finished(sweep):
@@ -88,7 +81,7 @@ def test_a_ray_in_each_job_of_ray_is_refused_before_anything_starts(tmp_path):
 )
 def test_a_signal_to_a_parallel_sweep_ends_its_jobs(tmp_path, launcher, number):
     process = start((*launcher, "seed=0,1", "total_frames=100_000_000"), tmp_path)
-    wait_until(lambda: len(list((tmp_path / "sweep").glob("*/metrics.csv"))) == 2, process)
+    wait_while_runs(process, lambda: len(list((tmp_path / "sweep").glob("*/metrics.csv"))) == 2)
     if number == signal.SIGINT:
         os.killpg(process.pid, number)  # as a terminal does
     else:

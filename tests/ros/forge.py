@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from tests.forge import Forge, forge_of
-from tests.ros.peer import Process, node_command, wait_for
+from tests.ros.peer import Process, node_command
+from tests.waiting import wait_for
 
 NODES = ("inference_node", "virtual_robot", "record", "command_watchdog", "excite")
 # A virtual robot imports its engine by its name.

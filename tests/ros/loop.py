@@ -11,7 +11,8 @@ from rclpy.qos import QoSProfile
 from sensor_msgs.msg import JointState
 
 from tests.ros.forge import forged
-from tests.ros.peer import Peer, Process, free_domain, wait_for
+from tests.ros.peer import Peer, Process, free_domain
+from tests.waiting import wait_for
 
 FAR = (-0.3, -0.2)  # m; ten seconds from home at 0.3 rad/s
 

@@ -36,22 +36,13 @@ from physai.processes import die_with
 from physai.ros.topics import qos
 from physai.ros.topics.commands import controller_topic
 from physai.signals import Quantity
+from tests.waiting import wait_for
 
 SHM = Path("/dev/shm")
 
 TOPIC = f"/{controller_topic(Quantity.JOINT_VELOCITY)}"
 
 _ASKED, _ANSWER = 3, 5.0  # how often a service is called at most, and s for an answer
-
-
-def wait_for(condition: Callable[[], Any], timeout: float = 60.0, what: str | Callable[[], str] = "") -> Any:
-    """Return what the condition returns as soon as it is true; ``what`` may be asked once it is too late."""
-    end = time.monotonic() + timeout
-    while not (result := condition()):
-        late = time.monotonic() >= end
-        assert not late, f"waited {timeout} s in vain: {(what() if callable(what) else what) or condition}"
-        time.sleep(0.002)
-    return result
 
 
 class Process:

@@ -16,7 +16,7 @@ from gymnasium.utils.env_checker import check_env
 import physai
 from physai.envs.simulation import Simulation
 from physai.physics import RobotState
-from tests.ros.peer import wait_for
+from tests.waiting import wait_for
 
 NAME = "physai/RosReach-v0"
 WITHOUT_ROS = "import sys; sys.modules['rclpy'] = None\n"  # as if it were not installed

@@ -14,7 +14,8 @@ from std_msgs.msg import Empty, Float64MultiArray
 
 from physai.ros.command_watchdog import CommandWatchdog
 from tests.ros.forge import forged
-from tests.ros.peer import TOPIC, Peer, free_domain, wait_for
+from tests.ros.peer import TOPIC, Peer, free_domain
+from tests.waiting import wait_for
 
 TIMEOUT = 0.1  # s
 

@@ -11,8 +11,8 @@ import pytest
 from geometry_msgs.msg import PointStamped
 from std_msgs.msg import Bool
 
-from tests.ros.peer import wait_for
 from tests.ros.test_fleet import Robot
+from tests.waiting import wait_for
 from tests.web.visitor import Visitor, shows
 
 ARM = ("-r", "__ns:=/arm1")

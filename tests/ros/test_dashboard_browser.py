@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from tests.ros.loop import Arm
-from tests.ros.peer import wait_for
 from tests.ros.test_dashboard import dashboard
+from tests.waiting import wait_for
 from tests.web.conftest import browser  # noqa: F401  # a fixture
-from tests.web.test_play import GREEN, REACH, Camera, colored, drag_along_y, picture, wait_until
+from tests.web.test_play import GREEN, REACH, Camera, colored, drag_along_y, picture
 
 SIZE = {"width": 1000, "height": 640}
 SEEN_FROM = ((0.0, -0.9 * REACH, 1.1 * REACH), (0.0, 0.0, 0.0))  # of one robot
@@ -50,12 +50,12 @@ def drag(page, seen, end, done):
             time.sleep(0.1)
         return found
 
-    wait_until(try_it, 120.0)
+    wait_for(try_it, 120.0)
 
 
 @pytest.mark.slow
 def test_a_goal_that_is_dragged_is_reached_a_stuck_arm_says_so_and_stop_all_stops_it(page, arm, peer, tmp_path):
-    wait_until(lambda: len(colored(picture(page), *GREEN)) > 50, 60.0)
+    wait_for(lambda: len(colored(picture(page), *GREEN)) > 50, 60.0)
     time.sleep(1.0)
     before = picture(page)
     page.screenshot(path=tmp_path / "before.png")

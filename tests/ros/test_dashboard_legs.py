@@ -9,7 +9,7 @@ from physai.ros.live.arm_view import ArmView
 from physai.ros.live.robots import Robots
 from physai.ros.live.status import Level
 from physai.web import serve
-from tests.ros.peer import wait_for
+from tests.waiting import wait_for
 
 
 @pytest.mark.slow

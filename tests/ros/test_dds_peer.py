@@ -7,7 +7,8 @@ import pytest
 
 from physai.deploy import load_policy
 from tests.ros.forge import forged
-from tests.ros.peer import Process, wait_for
+from tests.ros.peer import Process
+from tests.waiting import wait_for
 
 
 def reach(run: Path, goal: list[float], domain: int) -> None:

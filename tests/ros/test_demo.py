@@ -8,7 +8,8 @@ from pathlib import Path
 import imageio.v3 as imageio
 import pytest
 
-from tests.ros.peer import Peer, Process, wait_for
+from tests.ros.peer import Peer, Process
+from tests.waiting import wait_for
 
 # An arm that is driven may not be late, as it is where other tests start their processes on the same two cores.
 drives = pytest.mark.realtime

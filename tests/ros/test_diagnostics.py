@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from physai.deploy import load_policy
 from physai.ros.topics.diagnostics import Timing
 from tests.ros.loop import closed_loop
-from tests.ros.peer import wait_for
+from tests.waiting import wait_for
 
 
 def test_timing_knows_nothing_before_the_second_update():

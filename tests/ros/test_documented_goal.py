@@ -5,7 +5,7 @@ import threading
 from geometry_msgs.msg import PointStamped
 
 from tests.docs.blocks import blocks
-from tests.ros.peer import wait_for
+from tests.waiting import wait_for
 
 
 def test_the_goal_of_the_page_arrives(peer, domain, monkeypatch):

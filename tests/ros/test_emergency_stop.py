@@ -9,7 +9,8 @@ from std_msgs.msg import Bool, String
 from physai.ros.topics import qos
 from physai.ros.topics.emergency_stop import EmergencyStopTopic
 from tests.ros.loop import FAR, closed_loop
-from tests.ros.peer import Peer, wait_for
+from tests.ros.peer import Peer
+from tests.waiting import wait_for
 
 WITHIN = 0.02 + 0.03  # s: a period, and what the transport and a busy machine may take
 PROFILES = {

@@ -11,7 +11,7 @@ import pytest
 from physai.ros.node import estop_file
 from physai.ros.node.estop_file import EmergencyStopFile
 from tests.ros.loop import FAR, closed_loop
-from tests.ros.peer import wait_for
+from tests.waiting import wait_for
 
 NODE = "/left/inference_node"
 

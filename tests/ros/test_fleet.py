@@ -16,7 +16,8 @@ from std_msgs.msg import Bool, Float64MultiArray, String
 from physai.ros.topics import qos
 from physai.ros.topics.commands import controller_topic
 from physai.signals import Quantity
-from tests.ros.peer import Peer, Process, wait_for
+from tests.ros.peer import Peer, Process
+from tests.waiting import wait_for
 
 COMMANDS = controller_topic(Quantity.JOINT_VELOCITY)
 FAR = (-0.3, -0.2)

@@ -16,7 +16,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from std_msgs.msg import Header
 from websockets.sync.client import connect
 
-from tests.ros.peer import wait_for
+from tests.waiting import wait_for
 
 ROBOT = ("-r", "__ns:=/arm1")
 HEARD = {

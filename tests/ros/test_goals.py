@@ -7,7 +7,8 @@ import pytest
 from geometry_msgs.msg import PoseStamped
 
 from tests.ros.loop import FAR, closed_loop
-from tests.ros.peer import Peer, wait_for
+from tests.ros.peer import Peer
+from tests.waiting import wait_for
 
 BAD = {
     "of another frame": ((0.3, 0.3, "world"), "goal rejected: frame 'world' is not 'base'"),

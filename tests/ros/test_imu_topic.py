@@ -11,7 +11,7 @@ from physai.ros.driving.policies import robot_engine, robot_overrides
 from physai.ros.fleet import FleetConfig
 from physai.ros.inference_node import InferenceConfig, _first_goal
 from physai.ros.topics.imu import ImuTopic
-from tests.ros.peer import wait_for
+from tests.waiting import wait_for
 
 
 def reading(number, frame="trunk"):

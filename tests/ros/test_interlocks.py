@@ -9,7 +9,8 @@ from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Float64MultiArray
 
 from tests.ros.loop import FAR, Loop, closed_loop
-from tests.ros.peer import TOPIC, Peer, free_domain, wait_for
+from tests.ros.peer import TOPIC, Peer, free_domain
+from tests.waiting import wait_for
 
 WITHIN = 0.15  # s
 GOAL = list(FAR)

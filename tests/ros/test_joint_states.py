@@ -15,7 +15,7 @@ from sensor_msgs.msg import JointState
 from physai.ros.topics import qos
 from physai.ros.topics.joint_states import JointStates, Publishers
 from tests.ros.loop import Arm, closed_loop
-from tests.ros.peer import wait_for
+from tests.waiting import wait_for
 
 WITHIN = 0.15  # s
 

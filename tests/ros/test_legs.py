@@ -11,8 +11,8 @@ from std_msgs.msg import Float64MultiArray
 
 from physai.ros.topics.commands import controller_topic
 from physai.signals import Quantity
-from tests.ros.peer import wait_for
 from tests.ros.test_demo import demo
+from tests.waiting import wait_for
 
 pytestmark = [pytest.mark.slow, pytest.mark.realtime]
 COMMANDS = f"/{controller_topic(Quantity.JOINT_POSITION)}"

@@ -6,7 +6,7 @@ import time
 import pytest
 
 from tests.ros.loop import FAR, closed_loop
-from tests.ros.peer import wait_for
+from tests.waiting import wait_for
 
 WITHIN = 0.15  # s
 

@@ -18,9 +18,10 @@ from geometry_msgs.msg import PointStamped
 
 from tests.ros.forge import forged
 from tests.ros.loop import FAR, closed_loop
-from tests.ros.peer import Peer, free_domain, node_command, wait_for
+from tests.ros.peer import Peer, free_domain, node_command
 from tests.ros.test_command_watchdog import passes
 from tests.ros.test_record import KINDS, numbers, send_numbers
+from tests.waiting import wait_for
 
 WITHIN = 0.15  # s
 

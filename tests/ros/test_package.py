@@ -30,7 +30,8 @@ from physai.ros.inference_node import InferenceConfig
 from physai.ros.record import RecordConfig
 from physai.ros.topics import qos
 from physai.ros.virtual_robot import VirtualRobotConfig
-from tests.ros.peer import TOPIC, wait_for
+from tests.ros.peer import TOPIC
+from tests.waiting import wait_for
 from tests.web.visitor import Visitor, shows
 
 REPOSITORY = Path(__file__).parents[2]

@@ -16,7 +16,8 @@ from physai.physics import RobotState, nominal_dynamics
 from physai.robots import RobotSpec
 from physai.ros import RosPhysics
 from physai.ros.bridge.robot_link import RobotError
-from tests.ros.peer import TOPIC, wait_for
+from tests.ros.peer import TOPIC
+from tests.waiting import wait_for
 
 DT = 0.02
 OPTIONS = {"homing_speed": 2.0, "state_timeout": 0.5, "reset_service": "/virtual_robot/reset", "remap": []}

@@ -11,7 +11,8 @@ from std_msgs.msg import Float64MultiArray
 from physai.ros.topics.commands import controller_topic
 from physai.signals import Quantity
 from tests.ros.forge import forged
-from tests.ros.peer import Peer, wait_for
+from tests.ros.peer import Peer
+from tests.waiting import wait_for
 
 TOPIC = f"/{controller_topic(Quantity.JOINT_POSITION)}"
 ARM = {"overrides": "[env.robot.command=joint_position]"}

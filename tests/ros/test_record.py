@@ -19,7 +19,7 @@ from stereo_msgs.msg import DisparityImage
 
 from physai.errors import UserError
 from physai.ros.recording.bag import TYPES, Bag, recover
-from tests.ros.peer import wait_for
+from tests.waiting import wait_for
 
 KINDS = {
     "best_effort": QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT),

@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 
 from tests.ros.loop import FAR, closed_loop
-from tests.ros.peer import TOPIC, Peer, node_command, wait_for
+from tests.ros.peer import TOPIC, Peer, node_command
+from tests.waiting import wait_for
 
 GOAL = "[-0.3, -0.2]"
 ENDS = {

@@ -10,7 +10,7 @@ from physai.errors import UserError
 from physai.ros.bridge.robot_link import RobotLink
 from tests.ros.forge import forged
 from tests.ros.loop import closed_loop
-from tests.ros.peer import wait_for
+from tests.waiting import wait_for
 
 
 @pytest.fixture

@@ -10,7 +10,8 @@ from std_msgs.msg import Float64MultiArray
 
 from tests.ros.forge import forged
 from tests.ros.loop import FAR
-from tests.ros.peer import TOPIC, Peer, free_domain, wait_for
+from tests.ros.peer import TOPIC, Peer, free_domain
+from tests.waiting import wait_for
 
 NODE = "/virtual_robot"
 

@@ -8,7 +8,8 @@ from std_msgs.msg import Float64MultiArray
 
 from tests.ros.forge import forged
 from tests.ros.loop import FAR, closed_loop
-from tests.ros.peer import TOPIC, Peer, wait_for
+from tests.ros.peer import TOPIC, Peer
+from tests.waiting import wait_for
 
 WITHIN = 0.2  # s
 NAME = "/command_watchdog"

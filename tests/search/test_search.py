@@ -5,7 +5,6 @@ import json
 import os
 import signal
 import sys
-import time
 
 import pytest
 from hydra.core.global_hydra import GlobalHydra
@@ -16,6 +15,7 @@ from physai.search.space import make_space
 from physai.search.study import Study
 from physai.search.trials import time_to_target
 from tests.training.small import TINY, command
+from tests.waiting import wait_while_runs
 
 OVERRIDES = (*TINY, "collector=single", "algo.epochs=1", "~search@search.ranges", "hydra.run.dir=search")
 
@@ -99,20 +99,12 @@ def test_a_trial_that_looks_worse_is_stopped_and_has_saved_itself(run, tmp_path,
     assert "everything is saved" in (tmp_path / "search" / "0" / "output.txt").read_text()
 
 
-def wait_until(condition, process, seconds=240):
-    deadline = time.monotonic() + seconds
-    while not condition():
-        assert process.poll() is None, process.communicate()[0]
-        assert time.monotonic() < deadline
-        time.sleep(0.02)
-
-
 def test_a_killed_search_goes_on_redoes_nothing_and_tries_what_it_would_have_tried(run, tmp_path):
     ranges = {"algo.optimizer.lr": "interval(1e-3,1e-2)"}
     arguments = (*(f"{key}={text}" for key, text in ranges.items()), "search.trials=4", "search.jobs=2")
     folder = tmp_path / "search"
     process = command("search", *OVERRIDES, *arguments, cwd=tmp_path)
-    wait_until(lambda: summaries(folder) and len(list(folder.glob("[123]/metrics.csv"))), process)
+    wait_while_runs(process, lambda: summaries(folder) and len(list(folder.glob("[123]/metrics.csv"))))
     os.killpg(process.pid, signal.SIGKILL)
     process.wait()
     before = summaries(folder)

@@ -1,9 +1,7 @@
 """Who gets in, and who may command: by a real server, and clients that lie."""
 
-import time
 import urllib.error
 import urllib.request
-from collections.abc import Callable
 
 import pytest
 import viser
@@ -12,16 +10,10 @@ from websockets.exceptions import InvalidStatus
 
 from physai.web.door import Door, commander, guarding
 from physai.web.server import serve
+from tests.waiting import wait_for
 from tests.web.visitor import Visitor
 
 HERE, TOKEN = "127.0.0.2", "of-those-who-may-command"
-
-
-def wait_for(condition: Callable[[], object], seconds: float = 5.0) -> None:
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end, "waited in vain"
-        time.sleep(0.01)
 
 
 @pytest.mark.parametrize(

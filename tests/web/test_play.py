@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from physai.web.server import camera
+from tests.waiting import wait_for
 
 REACH = 0.55  # m, of the arm
 SIZE = {"width": 800, "height": 520}
@@ -90,14 +91,6 @@ def drag_along_y(page, seen, start, end):
     page.mouse.up()
 
 
-def wait_until(condition, seconds=20.0):
-    end = time.monotonic() + seconds
-    while not (found := condition()):
-        assert time.monotonic() < end, "it has not happened"
-        time.sleep(0.1)
-    return found
-
-
 @pytest.fixture
 def page(browser, serving, exported_run, tmp_path):
     shutil.copy(exported_run / "policy.pt", tmp_path)
@@ -112,8 +105,8 @@ def page(browser, serving, exported_run, tmp_path):
 @pytest.mark.slow
 def test_an_arm_follows_the_goal_that_the_mouse_drags_and_stands_still_when_paused(page):
     """Of a policy file alone, in another folder; the half minute goes into pictures, which no other test looks at."""
-    wait_until(lambda: len(colored(picture(page), *GREEN)) > 50)
-    wait_until(lambda: distance(page) < 0.05)
+    wait_for(lambda: len(colored(picture(page), *GREEN)) > 50)
+    wait_for(lambda: distance(page) < 0.05)
     time.sleep(1.0)
     before = picture(page)
     seen = Camera(before)
@@ -123,8 +116,8 @@ def test_an_arm_follows_the_goal_that_the_mouse_drags_and_stands_still_when_paus
     # Along the arrow that shows the axis y, to another place.
     there = -0.2
     drag_along_y(page, seen, (x, y), there)
-    wait_until(lambda: np.abs(goal_of(page, seen) - [x, there]).max() < 0.1, 30.0)
-    wait_until(lambda: distance(page) < 0.05)
+    wait_for(lambda: np.abs(goal_of(page, seen) - [x, there]).max() < 0.1, 30.0)
+    wait_for(lambda: distance(page) < 0.05)
     time.sleep(1.0)
     after = picture(page)
 
@@ -142,14 +135,14 @@ def test_an_arm_follows_the_goal_that_the_mouse_drags_and_stands_still_when_paus
     time.sleep(0.5)
     paused = picture(page)
     page.get_by_role("button", name="Another goal").click()
-    wait_until(lambda: np.abs(goal_of(page, seen) - [x, there]).max() > 0.1)
+    wait_for(lambda: np.abs(goal_of(page, seen) - [x, there]).max() > 0.1)
     still = np.median(upper_arm(picture(page), seen), axis=0)
     assert still == pytest.approx(np.median(upper_arm(paused, seen), axis=0), abs=3.0)
 
     far = distance(page)
     for _ in range(5):
         page.get_by_role("button", name="Step").click()
-    wait_until(lambda: far - distance(page) > 0.002)
+    wait_for(lambda: far - distance(page) > 0.002)
     time.sleep(1.0)
     stepped = distance(page)
     time.sleep(1.0)
@@ -159,10 +152,10 @@ def test_an_arm_follows_the_goal_that_the_mouse_drags_and_stands_still_when_paus
     next(menu for menu in menus if menu.input_value() == "pybullet").click()
     page.get_by_role("option", name="mujoco").click()
     page.get_by_role("button", name="Go on").click()
-    wait_until(lambda: distance(page) < 0.05)  # of the other engine's robot, which has a goal of its own
+    wait_for(lambda: distance(page) < 0.05)  # of the other engine's robot, which has a goal of its own
     assert counted(page, "Goals") == 1
     page.get_by_role("button", name="Reset").click()
-    wait_until(lambda: counted(page, "reached") == 0)
+    wait_for(lambda: counted(page, "reached") == 0)
 
 
 @pytest.fixture
@@ -189,7 +182,7 @@ def test_legs_walk_on_the_spot_as_the_sliders_ask(walk_page):
         for number, text in ((ahead, value), (turn, "0")):
             number.fill(text)
             number.press("Enter")
-        wait_until(lambda low=low, high=high: low <= speed(walk_page) <= high)
+        wait_for(lambda low=low, high=high: low <= speed(walk_page) <= high)
     assert walk_page.get_by_text("Falls: 0").is_visible()
 
 

@@ -14,6 +14,8 @@ from physai.training.evaluation import WATCHED, Recording, evaluate
 from physai.web import serve
 from physai.web.training import TrainingPage
 from tests.training.small import small_config
+from tests.waiting import wait_for
+from tests.web.test_play import picture
 
 
 def test_watching_changes_no_result_and_shows_the_first_robots():
@@ -41,9 +43,8 @@ def test_episodes_that_are_handed_over_move_the_arms_on_the_page_until_training_
     turning = np.linspace(0.0, 3.0, 200)[:, np.newaxis, np.newaxis] * np.ones((1, WATCHED, 2))
     shown.show(50_000, Recording(turning, np.full((WATCHED, 2), 0.3), np.arange(WATCHED) < 3))
     page.get_by_text("After 50,000 frames: 3 of these 8 episodes succeed.").wait_for()
-    first = page.locator("canvas").first.screenshot()
-    page.wait_for_timeout(1000)
-    assert page.locator("canvas").first.screenshot() != first
+    first = picture(page)
+    wait_for(lambda: (picture(page) != first).any(), 60.0, "another picture of the arms")
     page.close()
     shown.close()
     with pytest.raises(urllib.error.URLError, match="refused"):
