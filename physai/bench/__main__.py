@@ -5,11 +5,10 @@ from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 
-from rich.console import Console
-
 from physai import cli
 from physai.artifact import onnx
 from physai.bench.timing import machine
+from physai.cli.tables import show
 from physai.errors import UserError
 
 # Each is a module here, with a function ``run``.
@@ -63,7 +62,7 @@ def main() -> None:
             print(f"\n--{part}: {PARTS[part]}", flush=True)
             # Only what is measured is imported: ROS, for one, reads its environment then.
             tables.append(import_module(f"physai.bench.{part}").run(options))
-        Console().print(*tables)
+        show(*tables)
 
 
 def _options() -> argparse.Namespace:

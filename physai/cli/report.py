@@ -8,9 +8,9 @@ from typing import Any
 
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
-from rich.console import Console
 from rich.table import Table
 
+from physai.cli.tables import show
 from physai.errors import UserError
 from physai.processes import handling
 
@@ -45,7 +45,7 @@ class SweepReport(Callback):
         for run, summary in summaries.items():
             differs = " ".join(override for override in overrides[run] if override not in common)
             table.add_row(run.name, differs, *_figures(summary))
-        Console().print(table)
+        show(table)
         finished = [run for run, summary in summaries.items() if summary]
         if finished:
             try:  # Hydra would turn an error here into a warning, and forget the failures below

@@ -1,5 +1,6 @@
 """Find the robot whose motions are those that were recorded."""
 
+import logging
 import math
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
@@ -33,6 +34,9 @@ _EXPLAINED = 1.5  # times the noise, up to which the errors of motions held out 
 SPREAD = 1.96  # standard deviations of a 95 % interval
 
 Told = Callable[[str], None]
+
+# A robot that a fit tries may be one that no engine can step. It fits badly then, and that is all there is to tell.
+logging.getLogger("physai.physics").setLevel(logging.ERROR)
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,8 @@
 """MuJoCo as a batch of robots, with PyBullet's motors or with a drive's."""
 
+import logging
 import math
+from functools import cache
 from typing import Literal
 
 import numpy as np
@@ -30,6 +32,15 @@ except ImportError as error:  # it is three packages, which must be of one versi
     raise UserError(" ".join(str(error).split())) from error
 
 _STEPS_PER_TIME_CONSTANT = 7  # of a servo: with fewer, a joint at its effort limit chatters
+
+
+@cache
+def _warn(what: str) -> None:
+    logging.getLogger(__name__).warning("MuJoCo: %s (Others are not told.)", what)
+
+
+# By itself MuJoCo tells of every robot, and in a file of the current folder, too.
+mujoco.set_mju_user_warning(lambda text: _warn(text.partition(" Time = ")[0]))
 
 
 class MuJoCoPhysics:

@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import Any
 
 import pandas
-from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
 from physai import cli
+from physai.cli.tables import show
 from physai.search.space import overrides
 from physai.search.study import Study
 
@@ -69,7 +69,7 @@ class Report:
             shown.add_column(escape(column), justify="left" if column == "run" else "right")
         for row in best.head(_BEST).to_dict("records"):
             shown.add_row(*(escape(_short(row[column])) for column in ("run", self._objective, *self._names)))
-        Console().print(shown)
+        show(shown)
         plot_study(table, self._objective, self._study.minimize, self._names, self._folder / "study.png")
         print(f"All trials: {self._folder / 'study.csv'}, {self._folder / 'study.png'}. Train with the best values:")
         values = trials[int(best["run"].iloc[0])].params

@@ -7,10 +7,10 @@ from typing import Annotated
 
 from omegaconf import DictConfig
 from pydantic import Field
-from rich.console import Console
 from rich.table import Table
 
 from physai import cli
+from physai.cli.tables import show
 from physai.config import Count, Seed, validate
 from physai.errors import UserError
 from physai.evaluate import PolicyChoice
@@ -111,7 +111,7 @@ def _box(config: StressConfig) -> None:
         table.add_row(run, box.randomization, f"{box.share:.3f}", f"{box.volume:.3g}", settled)
         summary = {"run": run, "checkpoint": config.checkpoint, "seed": config.seed, **box.summary()}
         write_atomically(Path(run) / f"box_{box.randomization}.json", json.dumps(summary, indent=2).encode())
-    Console().print(table)
+    show(table)
 
 
 def _show(run: str, breaks: Breaks, config: StressConfig, policy: TrainedPolicy) -> None:
@@ -129,7 +129,7 @@ def _show(run: str, breaks: Breaks, config: StressConfig, policy: TrainedPolicy)
             f"{axis.low:g} to {axis.high:g}",
             *(_beyond(found[what]) for what in ("success", "settled")),
         )
-    Console().print(table)
+    show(table)
 
 
 def _beyond(ends: list[float | None]) -> str:
