@@ -29,6 +29,18 @@ def test_it_begins_with_weights_and_statistics_and_with_a_critic_of_its_own(expo
         assert all(torch.equal(value, trained[part][key]) for key, value in begun[part].items())
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", [("algo=sac",), ("policy=gru",), ("policy=history", "algo=a2c")], ids=" ".join)
+def test_policies_of_each_kind_go_on(kind, tmp_path):
+    """Ten seconds for networks of other shapes, and for what remembers."""
+    run_here(tmp_path / "first", *TINY, *kind)
+    run_here(tmp_path / "second", *TINY, *kind, f"pretrained={tmp_path / 'first'}", "total_frames=512")
+    with closing(Agent.build(small_config(*kind, f"pretrained={tmp_path / 'first'}"))) as agent:
+        begun, trained = agent.policy_state(), best_of(tmp_path / "first")
+    assert all(torch.equal(value, trained["actor"][key]) for key, value in begun["actor"].items())
+    assert json.loads((tmp_path / "second" / "summary.json").read_text())["frames"] == 512
+
+
 @pytest.mark.parametrize("collector", ["single", "async"])
 def test_robots_act_by_it_from_the_first_frame_on_in_the_collectors_processes_too(exported_run, collector):
     config = small_config(f"pretrained={exported_run}", f"collector={collector}", "collector.num_envs=32")
