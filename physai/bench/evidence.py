@@ -50,7 +50,7 @@ WAYS = {
     DRIVES: STRONG,
     "curriculum": (
         *("randomization=wide", "curriculum=adr"),
-        *("curriculum.results=8", "curriculum.step=0.15", "curriculum.narrow_below=0.8"),  # docs/curriculum.md
+        *("curriculum.results=8", "curriculum.step=0.15", "curriculum.narrow_below=0.8"),
     ),
 }
 ADAPTIVE, TUNED, IDENTIFIED = "adaptive, drives", "adaptive, fine-tuned", "identified, drives"
