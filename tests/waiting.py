@@ -1,9 +1,10 @@
 """Waiting for what happens elsewhere: polled, so that a busy machine makes a test slow and not wrong."""
 
-import subprocess
 import time
 from collections.abc import Callable
 from typing import Any
+
+from tests.forge import Forked
 
 
 def wait_for(condition: Callable[[], Any], timeout: float = 60.0, what: str | Callable[[], str] = "") -> Any:
@@ -16,12 +17,13 @@ def wait_for(condition: Callable[[], Any], timeout: float = 60.0, what: str | Ca
     return result
 
 
-def wait_while_runs(process: subprocess.Popen[str], condition: Callable[[], Any], timeout: float = 240.0) -> Any:
-    """The same, of a process that must not end before."""
+def wait_while_runs(process: Forked, condition: Callable[[], Any], timeout: float = 240.0, what: str = "") -> Any:
+    """Wait for what a process brings about; fail at once if it ends before."""
 
     def reached() -> Any:
+        ended = process.poll() is not None
         found = condition()
-        assert found or process.poll() is None, process.communicate()[0]
+        assert found or not ended, process.communicate()[0]
         return found
 
-    return wait_for(reached, timeout)
+    return wait_for(reached, timeout, what or f"what process {process.pid} was to bring about")

@@ -1,4 +1,4 @@
-"""Tables that nothing cuts off."""
+"""Tables that a file or a pipe does not cut."""
 
 import os
 import sys
@@ -6,10 +6,10 @@ import sys
 from rich.console import Console
 from rich.table import Table
 
-_WIDE = 250  # columns of a file or a pipe, which a reader can make as wide as they like
+_WIDE = 10_000  # columns, more than any table has
 
 
 def show(*tables: Table) -> None:
     """Print tables: as wide as the terminal, and elsewhere as wide as they are."""
-    told = sys.stdout.isatty() or "COLUMNS" in os.environ
+    told = sys.stdout.isatty() or os.environ.get("COLUMNS", "").isdigit()
     Console(width=None if told else _WIDE).print(*tables)

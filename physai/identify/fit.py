@@ -2,7 +2,8 @@
 
 import logging
 import math
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -34,9 +35,6 @@ _EXPLAINED = 1.5  # times the noise, up to which the errors of motions held out 
 SPREAD = 1.96  # standard deviations of a 95 % interval
 
 Told = Callable[[str], None]
-
-# A robot that a fit tries may be one that no engine can step. It fits badly then, and that is all there is to tell.
-logging.getLogger("physai.physics").setLevel(logging.ERROR)
 
 
 @dataclass(frozen=True)
@@ -148,6 +146,19 @@ class Predictor:
             physics.close()
 
 
+@contextmanager
+def _exploding_robots_unsaid() -> Iterator[None]:
+    """A robot that is tried may be one that no engine can step: it fits badly, and that is all there is to tell."""
+    log = logging.getLogger("physai.physics")
+    before = log.level
+    log.setLevel(logging.ERROR)
+    try:
+        yield
+    finally:
+        log.setLevel(before)
+
+
+@_exploding_robots_unsaid()
 def fit(predict: Predictor, trials: Trials, unknowns: Unknowns, longest: int, seed: int, told: Told) -> Fit:
     """Least squares from several starts, with delays about the best; bounded, by trust regions (``least_squares``).
 

@@ -2,7 +2,7 @@
 
 import logging
 import math
-from functools import cache
+from threading import Lock
 from typing import Literal
 
 import numpy as np
@@ -34,13 +34,20 @@ except ImportError as error:  # it is three packages, which must be of one versi
 _STEPS_PER_TIME_CONSTANT = 7  # of a servo: with fewer, a joint at its effort limit chatters
 
 
-@cache
-def _warn(what: str) -> None:
-    logging.getLogger(__name__).warning("MuJoCo: %s (Others are not told.)", what)
+_log, _told, _telling = logging.getLogger(__name__), set[str](), Lock()
 
 
-# By itself MuJoCo tells of every robot, and in a file of the current folder, too.
-mujoco.set_mju_user_warning(lambda text: _warn(text.partition(" Time = ")[0]))
+def _warn(text: str) -> None:
+    """Tell of one robot of a process; by itself MuJoCo tells of each, and in a file of the current folder, too."""
+    what = text.partition(" at ")[0]
+    with _telling:  # the threads of a batch come here
+        if what in _told or not _log.isEnabledFor(logging.WARNING):
+            return
+        _told.add(what)
+    _log.warning("MuJoCo: %s. Where a robot is unstable, it begins anew at zero. (This is said once.)", what)
+
+
+mujoco.set_mju_user_warning(_warn)
 
 
 class MuJoCoPhysics:

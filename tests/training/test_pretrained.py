@@ -18,26 +18,30 @@ def best_of(run):
     return checkpoint.load(run / "checkpoints" / "best.pt")
 
 
+def assert_same(begun, trained):
+    for part in ("actor", "normalization"):
+        assert begun[part].keys() == trained[part].keys()
+        assert all(torch.equal(value, trained[part][key]) for key, value in begun[part].items())
+
+
 def test_it_begins_with_weights_and_statistics_and_with_a_critic_of_its_own(exported_run):
     critic = "policy.critic.in_keys=[normalized_observation,features,relative_parameters]"
     rotors = "physics=mujoco", "physics.motor=servo", "env.robot.armature=0.01"  # which the other run knows nothing of
     with closing(Agent.build(small_config(f"pretrained={exported_run}", critic, *rotors))) as agent:
         begun, trained = agent.policy_state(), best_of(exported_run)
         assert "relative_parameters" in agent.critic.in_keys
-    for part in ("actor", "normalization"):
-        assert begun[part].keys() == trained[part].keys()
-        assert all(torch.equal(value, trained[part][key]) for key, value in begun[part].items())
+    assert_same(begun, trained)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", [("algo=sac",), ("policy=gru",), ("policy=history", "algo=a2c")], ids=" ".join)
 def test_policies_of_each_kind_go_on(kind, tmp_path):
-    """Ten seconds for networks of other shapes, and for what remembers."""
+    """Ten seconds each for networks of other shapes, and for what remembers."""
     run_here(tmp_path / "first", *TINY, *kind)
     run_here(tmp_path / "second", *TINY, *kind, f"pretrained={tmp_path / 'first'}", "total_frames=512")
     with closing(Agent.build(small_config(*kind, f"pretrained={tmp_path / 'first'}"))) as agent:
         begun, trained = agent.policy_state(), best_of(tmp_path / "first")
-    assert all(torch.equal(value, trained["actor"][key]) for key, value in begun["actor"].items())
+    assert_same(begun, trained)
     assert json.loads((tmp_path / "second" / "summary.json").read_text())["frames"] == 512
 
 

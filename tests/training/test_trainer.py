@@ -25,6 +25,7 @@ from tests.training.small import (
     small_config,
     train_here,
 )
+from tests.waiting import wait_while_runs
 
 
 def digest(run):
@@ -83,12 +84,6 @@ def test_one_seed_gives_one_run_and_another_seed_another(small_run, tmp_path):
     assert metrics(other) != metrics(run)
 
 
-def wait_until(condition, process, seconds=60):
-    end = time.monotonic() + seconds
-    while not condition() and process.poll() is None and time.monotonic() < end:
-        time.sleep(0.0005)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(("collector", "moment"), [("async", 0.0), ("async", "writing"), ("single", 0.1)])
 def test_a_run_killed_at_any_moment_and_resumed_ends_like_the_uninterrupted_one(
@@ -100,10 +95,11 @@ def test_a_run_killed_at_any_moment_and_resumed_ends_like_the_uninterrupted_one(
     checkpoints = tmp_path / "run" / "checkpoints"
     process = command("train", *SMALL, f"collector={collector}", "hydra.run.dir=run", cwd=tmp_path)
     if moment == "writing":
-        wait_until(lambda: checkpoints.is_dir() and len(list(checkpoints.glob("0*.pt"))) >= 2, process)
-        wait_until(lambda: any(checkpoints.glob(".*.tmp")), process)
+        wait_while_runs(process, lambda: len(list(checkpoints.glob("0*.pt"))) >= 2)
+        while not any(checkpoints.glob(".*.tmp")) and process.poll() is None:
+            time.sleep(0.0005)  # it is there for milliseconds; a process that it was missed in ends by itself
     else:
-        wait_until((tmp_path / "run" / "metrics.csv").is_file, process)
+        wait_while_runs(process, (tmp_path / "run" / "metrics.csv").is_file)
         time.sleep(moment)
     process.kill()
     assert process.wait() == -signal.SIGKILL
@@ -115,7 +111,7 @@ def test_a_run_killed_at_any_moment_and_resumed_ends_like_the_uninterrupted_one(
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_a_stopped_run_saves_says_how_to_go_on_and_goes_on(small_run, tmp_path, number, code):
     process = command("train", *SMALL, "checkpoint.every_frames=1000000", "hydra.run.dir=run", cwd=tmp_path)
-    wait_until((tmp_path / "run" / "metrics.csv").is_file, process)
+    wait_while_runs(process, (tmp_path / "run" / "metrics.csv").is_file)
     os.kill(process.pid, number)
     output = process.communicate()[0]
     assert process.returncode == code
