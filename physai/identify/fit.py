@@ -26,7 +26,6 @@ _SPOILT = 3.0  # times the errors of most motions: one with more is left out,
 _MOST_SPOILT = 0.34  # of the motions; if there were more, it is the model
 _ROUNDS = 3
 _PART = 0.25  # of a step of the recording: how finely a delay is found
-_EVERY = 4  # of the motions, one is held out
 _OFF = 3.0  # standard deviations by which it may have begun elsewhere than measured
 SHARE = 0.1  # of the largest in a direction, from which a parameter has a part in it
 _TOLD = 0.3  # units; a parameter of which less is known cannot be told
@@ -164,7 +163,7 @@ def fit(predict: Predictor, trials: Trials, unknowns: Unknowns, longest: int, se
 
     Errors far beyond those of most motions count less at first (Huber, 1964), and motions full of them are left out: a
     computer that was too late has spoilt them. Slopes come from one rollout in which each unknown is changed in a robot
-    of its own. Every fourth motion is held out; only where it began is found for it, as for the others.
+    of its own. A quarter of the motions is held out; only where they began is found for them, as for the others.
 
     Args:
         predict: Of the trials.
@@ -204,9 +203,13 @@ def fit(predict: Predictor, trials: Trials, unknowns: Unknowns, longest: int, se
         if not problem.leave_out(best, at):
             break
     others = [each for each in sorted(found, key=_cost)[:2] if each[1] != at and _cost(each) < _CLOSE * best.cost]
-    finalists = [(best, at), *others]
+    finalists = [(best.x, at), *((result.x, delay) for result, delay in others)]
+    no_stronger = best.x.copy()
+    no_stronger[: len(shown)] = np.where(shown == 0.0, best.x[: len(shown)], np.minimum(best.x[: len(shown)], shown))
+    if (no_stronger != best.x).any():  # a limit that is never reached may be too high
+        finalists.append((no_stronger, at))
     problem.trust()
-    best, at = min((problem.solve(result.x, delay, _LAST) for result, delay in finalists), key=_cost)
+    best, at = min((problem.solve(begin, delay, _LAST) for begin, delay in finalists), key=_cost)
     for way in (-_PART, _PART):
         while at + way >= 0 and _cost(better := problem.solve(best.x, at + way, _FIRST)) < best.cost:
             best, at = better
@@ -239,11 +242,9 @@ class _Problem:
 
     def __init__(self, predict: Predictor, trials: Trials, unknowns: Unknowns) -> None:
         self._predict, self._trials, self._unknowns = predict, trials, unknowns
-        every = min(_EVERY, len(trials))
-        held_out = np.arange(len(trials)) % every == every - 1
         measured = np.isfinite(trials.measured)
-        self._fitted = measured & ~held_out[:, None]
-        self._held_out = measured[:2] & held_out[:, None]
+        self._fitted = measured & ~trials.held_out[:, None]
+        self._held_out = measured[:2] & trials.held_out[:, None]
         self._noise = trials.noise[:, None, None, :]
         self._kept = np.ones(len(trials), dtype=bool)
         self._doubt = _DOUBT

@@ -20,6 +20,7 @@ _SHOWS = 3.0  # standard deviations, from which an acceleration does
 _FEWEST, _MOST = 2, 40  # motions: one to learn from, one to judge by; and more hardly tell more
 _LEAST_NOISE = np.array([1e-5, 1e-4])  # rad, rad/s; encoders resolve no more
 _LEAST_SHARE = 0.01  # of the largest effort, to which it is known: sensors of torque have errors of scale, too
+_PART_HELD_OUT = 4  # one of so many motions
 _LEAST_MOTION = 20.0  # times the noise of positions, that each joint must move in some trial
 
 
@@ -53,6 +54,20 @@ class Trials:
 
     def __len__(self) -> int:
         return len(self.start)
+
+    @property
+    def held_out(self) -> np.ndarray:
+        """The motions by which a fit is judged, [B]: a quarter, of those in which the fewest joints are at their best.
+
+        How strong a motor is may show in one motion only, and that one is needed to find it.
+        """
+        peaks = np.abs(np.nan_to_num(self.measured[1:])).max(axis=1)  # [2, B, n]
+        measured = peaks.max(axis=1) > 0.0
+        needed = np.bincount(peaks.argmax(axis=1)[measured], minlength=len(self))
+        others = np.flatnonzero(needed == needed.min())
+        count = min(max(1, len(self) // _PART_HELD_OUT), len(others))
+        chosen = others[((np.arange(count) + 0.5) * len(others) / count).astype(int)]
+        return np.isin(np.arange(len(self)), chosen)
 
 
 def cut(recording: Recording, name: str, joints: Sequence[str]) -> Trials:

@@ -6,6 +6,7 @@ FASTEST = 100.0  # rad/s; PyBullet lets no joint turn faster, before and after t
 _ERP = 0.2  # share of the way back to its limit that a joint goes in one substep
 # A joint that is farther beyond its limit is stopped, and not pushed back (Bullet's split impulse).
 _DEEPEST = 0.04  # rad
+_BRAKES = 25.0  # rad/s²; about what motors of arms brake with at most
 _ROUNDS, _TOGETHER = 100, 10
 _EXACT = 1e-9  # rad/s, and a share of the impulses
 
@@ -37,6 +38,26 @@ def motor_velocity(
     velocity[rows] = _solve(*(array[rows] for array in (mass, free, target, limit, lower, upper, impulse)))
     impulse[rows] = _product(mass[rows], velocity[rows] - free[rows])
     return velocity, np.clip(impulse, -limit, limit)  # beyond that it is a joint's limit that pushes
+
+
+def motor_effort(
+    limit: np.ndarray, friction: np.ndarray, command: np.ndarray, velocity: np.ndarray, dt: float
+) -> np.ndarray:
+    """Return the largest efforts that motors have left, N·m, where dry friction takes its share or helps, [N, n].
+
+    PyBullet's motors know of no such friction. It takes from a motor that speeds a joint up, and adds to one that
+    brakes, for as much of the step as that lasts: a slow joint soon stands, and speeds up the other way. So what no
+    encoder sees of a velocity does not decide where a robot goes.
+
+    Args:
+        limit: Largest efforts of the motors, N·m, [N, n].
+        friction: Of the joints, N·m, [N, n].
+        command: Velocities that the motors aim at, rad/s, [N, n].
+        velocity: Of the joints, rad/s, [N, n].
+        dt: Control period, s.
+    """
+    brakes = np.where((command - velocity) * velocity < 0.0, np.minimum(np.abs(velocity) / (_BRAKES * dt), 1.0), 0.0)
+    return np.maximum(limit - (1.0 - 2.0 * brakes) * friction, 0.0)
 
 
 def limit_velocity(beyond: np.ndarray, dt: float) -> np.ndarray:

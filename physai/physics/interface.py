@@ -7,8 +7,6 @@ import numpy as np
 
 from physai.robots import RobotSpec
 
-AT_REST = 1e-9  # rad²/s², of missing velocity times velocity: what rounding leaves of a joint that stands is no braking
-
 DynamicsParameters = dict[str, np.ndarray]
 """Per robot and absolute, each [rows, k]: ``link_mass`` (kg, one a moving link), ``payload`` (kg at the tip, 1), and
 one a joint of ``joint_damping`` (N·m·s/rad), ``joint_friction`` (N·m), ``effort_limit`` (N·m), ``armature`` (of the

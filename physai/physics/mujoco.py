@@ -9,9 +9,8 @@ import numpy as np
 
 from physai.config import Count, PositiveFloat
 from physai.errors import UserError
-from physai.physics.impulse import FASTEST, limit_velocity, motor_velocity
+from physai.physics.impulse import FASTEST, limit_velocity, motor_effort, motor_velocity
 from physai.physics.interface import (
-    AT_REST,
     DynamicsParameters,
     RobotState,
     at_home,
@@ -206,27 +205,24 @@ class _Impulse:
             columns = model.M_colind[start : start + count]
             self._places[row, columns] = self._places[columns, row] = np.arange(start, start + count)
         shape = self._position.shape
-        self._speeding, self._braking, self._gain = np.zeros(shape), np.zeros(shape), np.zeros(shape)
+        self._limit, self._friction, self._gain = np.zeros(shape), np.zeros(shape), np.zeros(shape)
         self.effort = np.zeros(shape)
 
     def set(self, rows: np.ndarray, parameters: DynamicsParameters) -> None:
-        dt = self._batch.model.opt.timestep
-        limit, friction = parameters["effort_limit"], parameters["joint_friction"]
-        # Friction takes its share of the effort when the motor speeds a joint up, and helps when it brakes.
-        self._speeding[rows], self._braking[rows] = dt * np.maximum(limit - friction, 0.0), dt * (limit + friction)
+        self._limit[rows], self._friction[rows] = parameters["effort_limit"], parameters["joint_friction"]
         gain = np.minimum(parameters["velocity_gain"], 1.0)
         self._gain[rows] = gain / (gain + self._substeps * (1.0 - gain))  # the time constant stays the same
 
     def step(self, command: np.ndarray) -> None:
         dt = self._batch.model.opt.timestep
         position, velocity = self._position.copy(), self._velocity.copy()
-        effort = np.where((command - velocity) * velocity < -AT_REST, self._braking, self._speeding)
+        largest = dt * motor_effort(self._limit, self._friction, command, velocity, self._substeps * dt)
         for _ in range(self._substeps):
             self._batch.forward()
             free = np.clip(velocity + dt * self._acceleration, -FASTEST, FASTEST)
             target = free + self._gain * (command - free)
             low, high = limit_velocity(self._lower - position, dt), -limit_velocity(position - self._upper, dt)
-            velocity, impulse = motor_velocity(self._mass[:, self._places], free, target, effort, low, high)
+            velocity, impulse = motor_velocity(self._mass[:, self._places], free, target, largest, low, high)
             velocity = np.clip(velocity, -FASTEST, FASTEST)
             position += dt * velocity
             self._position[:], self._velocity[:] = position, velocity

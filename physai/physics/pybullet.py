@@ -10,8 +10,8 @@ import numpy as np
 import pybullet as bullet
 
 from physai.errors import UserError
+from physai.physics.impulse import motor_effort
 from physai.physics.interface import (
-    AT_REST,
     DynamicsParameters,
     RobotState,
     at_home,
@@ -51,8 +51,8 @@ class PyBulletPhysics:
 
     Joints that are springs (``servo`` of the robot) are given their effort once a substep. Elsewhere each joint
     is driven by PyBullet's velocity motor with a limited effort; where the robot takes positions, a servo
-    tells the motor how fast to go, once a control period. Coulomb friction has no counterpart in
-    PyBullet's motors; it takes its share of the effort when the motor speeds a joint up, and helps when it brakes.
+    tells the motor how fast to go, once a control period. Of its effort, dry
+    friction takes its share (:func:`physai.physics.impulse.motor_effort`).
 
     Args:
         spec: The robot.
@@ -72,7 +72,7 @@ class PyBulletPhysics:
             raise UserError(f"robot '{spec.name}': PyBullet has no rotors (armature: 0, or physics=mujoco)")
         self.num_robots = num_robots
         self.substeps = substeps
-        self._spec = spec
+        self._spec, self._control_dt = spec, control_dt
         self._worlds: list[_World] = []
         self._finalizer = weakref.finalize(self, _disconnect, self._worlds)
         try:
@@ -104,8 +104,8 @@ class PyBulletPhysics:
         self._base = FloatingBodies(spec.floating, self._row, loaded_links(spec), links) if spec.floating else None
         # Of all joints of all robots, in lists: what PyBullet takes and gives are single numbers.
         self._position, self._velocity, self._effort = ([0.0] * (num_robots * n) for _ in range(3))
-        # Body, joint, effort to speed up and to brake with, gain.
-        self._motors = [(body, joint, 0.0, 0.0, 0.0) for _, body in self._row for joint in joints]
+        # Body, joint, gain.
+        self._motors = [(body, joint, 0.0) for _, body in self._row for joint in joints]
         self._parameters = {key: np.repeat(value, num_robots, axis=0) for key, value in nominal_dynamics(spec).items()}
         self.reset(np.arange(num_robots), at_home(spec, num_robots), self._parameters)
 
@@ -146,17 +146,13 @@ class PyBulletPhysics:
         if self._springs is not None:
             self._springs.set(rows, {key: value[rows] for key, value in self._parameters.items()})
             return
-        limit, friction, gain = (
-            self._parameters[key][rows] for key in ("effort_limit", "joint_friction", "velocity_gain")
-        )
         # Applied once a substep: the time constant stays the same, and how far gravity pulls a joint down.
-        gain = np.minimum(gain, 1.0)
+        gain = np.minimum(self._parameters["velocity_gain"][rows], 1.0)
         gain /= gain + self.substeps * (1.0 - gain)
-        speeding, braking = np.maximum(limit - friction, 0.0), np.maximum(limit + friction, 0.0)
         n = len(self._joints)
-        for row, *values in zip(rows.tolist(), speeding.tolist(), braking.tolist(), gain.tolist(), strict=True):
+        for row, gains in zip(rows.tolist(), gain.tolist(), strict=True):
             bodies = [self._row[row][1]] * n
-            self._motors[row * n : (row + 1) * n] = zip(bodies, self._joints, *values, strict=True)
+            self._motors[row * n : (row + 1) * n] = zip(bodies, self._joints, gains, strict=True)
 
     def step(self, command: np.ndarray) -> RobotState:
         """See :meth:`physai.physics.Physics.step`."""
@@ -171,12 +167,15 @@ class PyBulletPhysics:
         if self._spec.command is Quantity.JOINT_POSITION:
             fastest, to_go = self._spec.velocity_limit, command - self.robot_state().joint_position
             command = np.clip(self._spec.position_gain * to_go, -fastest, fastest)
-        self._advance(command.ravel().tolist())
+        limit, friction = self._parameters["effort_limit"], self._parameters["joint_friction"]
+        velocity = np.array(self._velocity).reshape(expected)
+        effort = motor_effort(limit, friction, command, velocity, self._control_dt)
+        self._advance(command.ravel().tolist(), effort.ravel().tolist())
         return self.robot_state()
 
-    def _advance(self, targets: list[float]) -> None:
+    def _advance(self, targets: list[float], largest: list[float]) -> None:
         # One flat pass over all joints of all robots: this loop is what collection costs most.
-        commands = zip(self._motors, targets, self._velocity, strict=True)
+        commands = zip(self._motors, targets, largest, strict=True)
         command, step, read = bullet.setJointMotorControl2, bullet.stepSimulation, bullet.getJointStates
         mode, joints = bullet.VELOCITY_CONTROL, self._joints
         positions: list[float] = []
@@ -185,8 +184,7 @@ class PyBulletPhysics:
         for world in self._worlds:
             client = world.client
             motors = islice(commands, len(world.bodies) * len(joints))
-            for (body, joint, speeding, braking, gain), target, velocity in motors:
-                effort = braking if (target - velocity) * velocity < -AT_REST else speeding
+            for (body, joint, gain), target, effort in motors:
                 command(body, joint, mode, 0.0, target, effort, 0.1, gain, 0.0, client)
             for _ in range(self.substeps):
                 step(client)

@@ -140,6 +140,19 @@ def test_with_efforts_the_scale_of_masses_and_effort_limits_is_found(env_config,
 
 
 @pytest.mark.slow
+def test_an_effort_limit_that_few_motions_reach_is_found_from_one_that_none_would(env_config, strong):
+    """No slope leads there from the description's limit; from the largest effort that was measured, one does."""
+    config = env_config("reacher", "physics=mujoco")
+    names = [*ALL, "effort_limit"]
+    hidden = record(config, strong, names, 30.0, 9, feels=True)
+    result = found(hidden, config, names, longest=3)
+    truth = hidden.parameters[result.unknowns.columns]
+    at = [result.unknowns.labels.index(f"{name}[joint2]") for name in ("effort_limit", "joint_friction")]
+    assert result.values[at].sum() == pytest.approx(truth[at].sum(), rel=0.005)  # it only ever reaches it to brake
+    assert (result.after < 1.2 * NOISE[0]).all()
+
+
+@pytest.mark.slow
 def test_motions_in_which_commands_came_late_are_left_out_and_named(env_config, strong):
     config = env_config("reacher", "physics=mujoco")
     hidden = record(config, strong, ["velocity_gain"], 20.0, 2)

@@ -93,6 +93,15 @@ def test_motions_begin_where_commands_change_after_a_rest(hidden):
     assert np.isfinite(trials.measured).any(axis=(0, 1, 3)).all()
 
 
+def test_the_motion_in_which_a_motor_was_strongest_is_not_held_out(hidden):
+    trials = cut(hidden.recording, "robot", hidden.spec.joints)
+    assert trials.held_out.sum() == max(1, len(trials) // 4)
+    for number in range(len(trials)):
+        measured = trials.measured.copy()
+        measured[2] = np.arange(len(trials))[:, None] == number
+        assert not dataclasses.replace(trials, measured=measured).held_out[number]
+
+
 def moving_before(hidden, speed, told):
     """The first motion begins at a speed; whether the velocities that were measured say so, too."""
     recording = hidden.recording

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from physai.physics.impulse import limit_velocity, motor_velocity
+from physai.physics.impulse import limit_velocity, motor_effort, motor_velocity
 
 
 def problem(random, robots, joints):
@@ -41,6 +41,18 @@ def test_a_limit_holds_against_any_motor_and_only_pushes_away_from_itself():
     weak = motor_velocity(mass, np.full((3, 2), -5.0), target, np.full((3, 2), 0.1), lower, upper)[0]
     np.testing.assert_allclose(weak[:2, 1], 0.3, atol=1e-9)
     assert (weak[2] < -4).all()
+
+
+def test_friction_helps_a_motor_for_as_much_of_a_step_as_it_brakes():
+    velocity = np.array([[2.0, 0.5, 0.25, 1e-9, 0.0, -2.0, 2.0]])
+    command = np.array([[-1.0, -1.0, -1.0, -1.0, -1.0, -3.0, 0.5]])
+    found = motor_effort(np.full((1, 7), 3.0), np.full((1, 7), 1.0), command, velocity, 0.02)
+    np.testing.assert_allclose(found, [[4.0, 4.0, 3.0, 2.0, 2.0, 2.0, 4.0]], atol=1e-6)
+
+
+def test_a_motor_that_is_too_weak_for_the_friction_gives_nothing():
+    one = np.ones((1, 1))
+    assert motor_effort(one, 1.5 * one, one, 0.0 * one, 0.02) == 0.0
 
 
 def test_a_limit_is_where_a_joint_is_pushed_back():
