@@ -3,12 +3,11 @@
 import json
 import os
 import signal
-import time
 
 import pytest
 
 from tests.training.small import TINY, command
-from tests.waiting import wait_while_runs
+from tests.waiting import wait_for, wait_while_runs
 
 SWEEP = ("-m", *TINY, "hydra.sweep.dir=sweep")
 
@@ -26,14 +25,14 @@ def finished(sweep):
 
 
 def assert_nothing_is_left_of(group, seconds=30):
-    deadline = time.monotonic() + seconds
-    while True:
+    def gone():
         try:
             os.killpg(group, 0)
         except ProcessLookupError:
-            return
-        assert time.monotonic() < deadline, f"a process of group {group} still runs"
-        time.sleep(0.1)
+            return True
+        return False
+
+    wait_for(gone, seconds, f"the processes of group {group} to end")
 
 
 def test_joblib_runs_three_seeds_in_two_processes(tmp_path):

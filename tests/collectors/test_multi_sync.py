@@ -10,6 +10,7 @@ import torch
 
 from physai.errors import UserError
 from tests.collectors.parts import assert_equal
+from tests.waiting import wait_for
 
 
 @pytest.mark.slow
@@ -118,7 +119,4 @@ def test_workers_die_with_a_learner_that_is_killed(kind):
     assert all(is_alive(worker) for worker in workers)
     learner.kill()
     learner.communicate()
-    deadline = time.monotonic() + 10
-    while any(is_alive(worker) for worker in workers) and time.monotonic() < deadline:
-        time.sleep(0.05)
-    assert not any(is_alive(worker) for worker in workers)
+    wait_for(lambda: not any(is_alive(worker) for worker in workers), 10, "workers to die")

@@ -23,6 +23,7 @@ from hatchling.builders.wheel import WheelBuilder
 
 from tests.training.processes import all_gone, command_of, descendants
 from tests.training.small import SIZES, assert_same_run, command, undisturbed
+from tests.waiting import wait_while_runs
 
 pytest.importorskip("ray")
 pytestmark = [
@@ -144,8 +145,7 @@ def test_a_run_that_loses_a_computer_ends_in_one_line_and_goes_on_when_it_is_bac
     computers.switch_on()
     lost = command("train", *joining, *SIZES, "hydra.run.dir=lost", cwd=tmp_path)
     saved = tmp_path / "lost" / "checkpoints"
-    while lost.poll() is None and len(list(saved.glob("0*.pt"))) < 2:
-        time.sleep(0.02)
+    wait_while_runs(lost, lambda: len(list(saved.glob("0*.pt"))) >= 2)
     assert computers.workers() == {str(computers.folder)}
     computers.switch_off()
     output = lost.communicate(timeout=120)[0]

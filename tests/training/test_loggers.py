@@ -1,7 +1,6 @@
 """Where a run is logged besides its CSV files: each logger for real, and offline."""
 
 import sys
-import time
 
 import pytest
 
@@ -9,6 +8,7 @@ from physai.errors import UserError
 from physai.training.agent import make_logger
 from physai.training.logs import RunLog
 from tests.training.small import small_config
+from tests.waiting import wait_for
 
 
 def log(config, run, frames):
@@ -53,14 +53,13 @@ def test_wandb_keeps_config_and_metrics_and_a_resumed_run_has_the_same_id(tmp_pa
     config = small_config("logger=wandb", "logger.offline=true")
     ids = [log(config, tmp_path, frames)._wandb_kwargs["id"] for frames in (10, 20)]
     assert ids[0] == ids[1]
-    deadline = time.monotonic() + 30  # a process of wandb's own writes them
-    while time.monotonic() < deadline:
+
+    def written():
         parts = [path.read_bytes() for path in (tmp_path / "wandb").glob(f"offline-run-*/run-{ids[0]}.wandb")]
-        written = [b"algo.optimizer.lr" in part and b"evaluation/success_rate" in part for part in parts]
-        if parts and all(written):
-            return
-        time.sleep(0.2)
-    raise AssertionError(f"{len(parts)} parts of a run, complete: {written}")
+        return [b"algo.optimizer.lr" in part and b"evaluation/success_rate" in part for part in parts]
+
+    # A process of wandb's own writes them.
+    wait_for(lambda: written() and all(written()), 30, lambda: f"parts of a run to be complete: {written()}")
 
 
 @pytest.mark.parametrize("name", ["wandb", "mlflow"])

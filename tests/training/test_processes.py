@@ -10,6 +10,7 @@ import pytest
 
 from tests.training.processes import all_gone, command_of, descendants
 from tests.training.small import SIZES, assert_same_run, command, metrics, resume_here, undisturbed
+from tests.waiting import wait_while_runs
 
 needs_ray = pytest.mark.skipif(find_spec("ray") is None, reason="needs ray")
 COLLECTORS = ("async", "multi_sync", "multi_async", pytest.param("ray", marks=needs_ray))
@@ -41,11 +42,7 @@ class Run:
         arguments = ["resume=run"] if self.path.is_dir() else begin
         # A process group, as a terminal makes.
         self.process = command("train", *arguments, cwd=self.folder)
-        deadline = time.monotonic() + 120
-        while not self._has_learnt(log, before, saved) and self.process.poll() is None:
-            assert time.monotonic() < deadline
-            time.sleep(0.005)
-        assert self.process.poll() is None, self.process.communicate()[0]
+        wait_while_runs(self.process, lambda: self._has_learnt(log, before, saved), 120)
         self.everybody = descendants(self.process.pid)
         is_ray = self.collector == "ray"
         self.workers = {one for one in self.everybody if not is_ray or "WorkerCollector" in command_of(one)}
