@@ -90,7 +90,7 @@ def identify(hidden: Hidden, config: EnvConfig, names: list[str]) -> Found:
         names: What is looked for.
     """
     started = time.perf_counter()
-    trials = cut(hidden.recording, "robot", hidden.spec.joints)
+    trials = cut(hidden.recording, "robot", hidden.spec)
     spec = RobotSpec.from_config(config.robot)
     unknowns = Unknowns.of(names, spec, ParameterLayout(spec))
     physics = config.physics | {"threads": cores()}

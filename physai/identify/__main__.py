@@ -55,10 +55,9 @@ class IdentifyConfig(Config):
                 raise UserError(f"fit: this engine cannot change '{name}': physics=mujoco can")
         return env, spec, unknowns
 
-    def trials(self, env: EnvConfig) -> Trials:
+    def trials(self, env: EnvConfig, spec: RobotSpec) -> Trials:
         """Read the data."""
-        joints = env.robot.joints
-        return cut(read(Path(self.data), joints, env.control_dt, self.command_topic), self.data, joints)
+        return cut(read(Path(self.data), spec.joints, env.control_dt, self.command_topic), self.data, spec)
 
     @property
     def folder(self) -> Path:
@@ -73,7 +72,7 @@ def _check(node: DictConfig) -> None:
         raise UserError(f"output: {config.folder} is no folder")
     env, spec, _ = config.robot()
     config.randomization.check(ParameterLayout(spec))
-    trials = config.trials(env)
+    trials = config.trials(env, spec)
     if "effort_limit" in config.fit and not np.isfinite(trials.measured[2]).any():
         raise UserError(
             f"fit: effort_limit does not show in {config.data}, which has no efforts: with twice the masses, damping, "
@@ -84,7 +83,7 @@ def _check(node: DictConfig) -> None:
 def _identify(node: DictConfig, _: Path) -> None:
     config = validate(IdentifyConfig, node)
     env, spec, unknowns = config.robot()
-    trials = config.trials(env)
+    trials = config.trials(env, spec)
     # No result depends on the number of threads.
     threads = {"threads": config.threads or cores()} if "threads" in env.physics else {}
     console = Console(record=True)

@@ -1,6 +1,5 @@
 """Motions that begin at rest or at a steady speed, cut out of a recording: what an identification predicts."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -8,6 +7,7 @@ import numpy as np
 
 from physai.errors import UserError
 from physai.identify.recording import Recording
+from physai.robots import RobotSpec
 
 _STILL = 0.5  # s with one command, after which a robot has come to rest, or to a steady speed
 _MEAN = 0.24  # s of this, from which it comes where a motion begins
@@ -20,6 +20,7 @@ _SHOWS = 3.0  # standard deviations, from which an acceleration does
 _FEWEST, _MOST = 2, 40  # motions: one to learn from, one to judge by; and more hardly tell more
 _LEAST_NOISE = np.array([1e-5, 1e-4])  # rad, rad/s; encoders resolve no more
 _LEAST_SHARE = 0.01  # of the largest effort, to which it is known: sensors of torque have errors of scale, too
+_OFF_LIMITS = 0.01  # rad from the limits of joints, within which a motion ends: what a limit does is not looked for
 _PART_HELD_OUT = 4  # one of so many motions
 _LEAST_MOTION = 20.0  # times the noise of positions, that each joint must move in some trial
 
@@ -70,18 +71,19 @@ class Trials:
         return np.isin(np.arange(len(self)), chosen)
 
 
-def cut(recording: Recording, name: str, joints: Sequence[str]) -> Trials:
+def cut(recording: Recording, name: str, spec: RobotSpec) -> Trials:
     """Cut a recording wherever the robot has come to rest, or to a steady speed, as an arm that sinks.
 
     Args:
         recording: At least two motions, each after half a second with one command.
         name: Of the recording, for messages.
-        joints: Their names.
+        spec: The robot as described: names and limits of its joints.
 
     Raises:
         UserError: If there are no two such motions, or a joint hardly moves in them.
     """
-    motions, left_out = _motions(recording)
+    joints = spec.joints
+    motions, left_out = _motions(recording, spec.position_limit)
     if len(motions) < _FEWEST:
         raise UserError(
             f"{name}: {len(motions)} motions begin at rest or at a steady speed, and at least {_FEWEST} are needed: "
@@ -134,8 +136,10 @@ class _Begin:
     degrees: np.ndarray  # of freedom of these, [2]
 
 
-def _motions(recording: Recording) -> tuple[list[_Motion], list[str]]:
+def _motions(recording: Recording, limits: np.ndarray) -> tuple[list[_Motion], list[str]]:
     """Find the motions, and say what of the recording is left out."""
+    lowest, highest = limits[:, 0] + _OFF_LIMITS, limits[:, 1] - _OFF_LIMITS
+    at_limit: np.ndarray = ((recording.position < lowest) | (recording.position > highest)).any(axis=1)
     known = np.isfinite(recording.command).all(axis=1)
     changed = np.ones(len(recording), dtype=bool)
     changed[1:] = ~(known[1:] & known[:-1]) | (recording.command[1:] != recording.command[:-1]).any(axis=1)
@@ -152,6 +156,10 @@ def _motions(recording: Recording) -> tuple[list[_Motion], list[str]]:
         if len(unknown):
             last = first + int(unknown[0])
             left_out.append(f"{at}: no command is known from {last * recording.period:.2f} s on")
+        reached = first + np.flatnonzero(at_limit[first : last + 1])
+        if len(reached):
+            last = max(int(reached[0]) - 1, first)
+            left_out.append(f"{at}: a joint is at its limit from {reached[0] * recording.period:.2f} s on")
         measured = _measured(recording)[:, first - mean + 1 : first + 1]
         known_at = np.isfinite(measured).all(axis=(0, 2))
         if last - first < shortest:

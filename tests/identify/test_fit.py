@@ -24,7 +24,7 @@ def strong():
 
 
 def found(hidden, config, names, longest=4):
-    trials = cut(hidden.recording, "robot", hidden.spec.joints)
+    trials = cut(hidden.recording, "robot", hidden.spec)
     spec = RobotSpec.from_config(config.robot)
     unknowns = Unknowns.of(names, spec, ParameterLayout(spec))
     with closing(Predictor(spec, config.physics, hidden.recording.period, trials)) as predict:
@@ -88,7 +88,7 @@ def test_an_arm_that_sinks_under_its_load_is_found_near_home_from_motions_that_b
     hidden = record(config, loaded, ["payload", "velocity_gain"], 10.0, 0, feels=True, near=True)
     assert (np.abs(hidden.recording.command) <= hidden.spec.command_limit).all()
     assert (np.abs(hidden.recording.position - hidden.spec.home) < 0.7).all()
-    assert np.abs(cut(hidden.recording, "robot", hidden.spec.joints).velocity).max() > 0.04
+    assert np.abs(cut(hidden.recording, "robot", hidden.spec).velocity).max() > 0.04
     result = found(hidden, config, ["payload", "velocity_gain"], longest=3)
     assert result.explained
     assert result.delay == hidden.delay
@@ -99,7 +99,7 @@ def test_an_arm_that_sinks_under_its_load_is_found_near_home_from_motions_that_b
 def test_a_motion_is_predicted_from_the_speed_at_which_it_begins(env_config, strong):
     config = env_config("reacher", "physics=mujoco", "physics.motor=servo")
     hidden = record(config, strong, [], 8.0, 0)
-    trials = cut(hidden.recording, "robot", hidden.spec.joints)
+    trials = cut(hidden.recording, "robot", hidden.spec)
     standing = dataclasses.replace(trials, command=np.zeros_like(trials.command))
     moving = dataclasses.replace(standing, velocity=standing.velocity + 0.3)
     velocities = []
@@ -157,7 +157,7 @@ def test_motions_in_which_commands_came_late_are_left_out_and_named(env_config, 
     config = env_config("reacher", "physics=mujoco")
     hidden = record(config, strong, ["velocity_gain"], 20.0, 2)
     recording = hidden.recording
-    trials = cut(recording, "robot", hidden.spec.joints)
+    trials = cut(recording, "robot", hidden.spec)
     first = round(trials.begins[1] / recording.period)
     command = recording.command.copy()
     command[first : first + 60] = recording.command[first + 6 : first + 66]  # it is said that they came sooner

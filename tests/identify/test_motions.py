@@ -154,6 +154,6 @@ def test_what_a_simulated_robot_does_is_cut_into_its_motions(env_config):
         rows.append((state.joint_position[0], state.joint_velocity[0], command, state.joint_effort[0]))
         physics.step(command[None])
     physics.close()
-    trials = cut(Recording(config.control_dt, *map(np.array, zip(*rows, strict=True))), "it", spec.joints)
+    trials = cut(Recording(config.control_dt, *map(np.array, zip(*rows, strict=True))), "it", spec)
     assert len(trials) == len(excitation.motions)
     assert not trials.left_out

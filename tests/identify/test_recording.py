@@ -85,7 +85,7 @@ def test_with_lost_rows_their_commands_are_lost_and_the_rest_is_as_it_was(hidden
 
 
 def test_motions_begin_where_commands_change_after_a_rest(hidden):
-    trials = cut(hidden.recording, "robot", hidden.spec.joints)
+    trials = cut(hidden.recording, "robot", hidden.spec)
     assert len(trials) >= 3
     assert not trials.before.any()
     assert trials.command[0].any(axis=1).all()
@@ -94,7 +94,7 @@ def test_motions_begin_where_commands_change_after_a_rest(hidden):
 
 
 def test_the_motion_in_which_a_motor_was_strongest_is_not_held_out(hidden):
-    trials = cut(hidden.recording, "robot", hidden.spec.joints)
+    trials = cut(hidden.recording, "robot", hidden.spec)
     assert trials.held_out.sum() == max(1, len(trials) // 4)
     for number in range(len(trials)):
         measured = trials.measured.copy()
@@ -117,9 +117,9 @@ def moving_before(hidden, speed, told):
 
 @pytest.mark.parametrize("slower", [0.0, 0.3])
 def test_a_motion_may_begin_at_a_speed_that_hardly_changes(hidden, slower):
-    whole = cut(hidden.recording, "robot", hidden.spec.joints)
+    whole = cut(hidden.recording, "robot", hidden.spec)
     first, recording = moving_before(hidden, lambda time: 0.5 - slower * np.asarray(time), 1.0)
-    steady = cut(recording, "robot", hidden.spec.joints)
+    steady = cut(recording, "robot", hidden.spec)
     assert len(steady) == len(whole)
     assert not steady.left_out
     np.testing.assert_allclose(steady.velocity[0], 0.5, atol=0.03)
@@ -135,9 +135,9 @@ def test_a_motion_may_begin_at_a_speed_that_hardly_changes(hidden, slower):
     [(2.0, 1.0, "its speed still changes when it begins"), (0.0, 0.0, "positions and velocities that were measured")],
 )
 def test_a_motion_whose_beginning_is_not_known_is_left_out_and_it_is_said_why(hidden, slower, told, line):
-    whole = cut(hidden.recording, "robot", hidden.spec.joints)
+    whole = cut(hidden.recording, "robot", hidden.spec)
     first, recording = moving_before(hidden, lambda time: 0.5 - slower * np.asarray(time), told)
-    steady = cut(recording, "robot", hidden.spec.joints)
+    steady = cut(recording, "robot", hidden.spec)
     assert len(steady) == len(whole) - 1
     (why,) = steady.left_out
     assert why.startswith(f"at {first * 0.02:.2f} s: {line}")
@@ -145,20 +145,33 @@ def test_a_motion_whose_beginning_is_not_known_is_left_out_and_it_is_said_why(hi
 
 def test_a_motion_ends_where_a_command_is_not_known_and_it_is_said(hidden):
     command = hidden.recording.command.copy()
-    whole = cut(hidden.recording, "robot", hidden.spec.joints)
+    whole = cut(hidden.recording, "robot", hidden.spec)
     first = int(np.flatnonzero(command.any(axis=1))[0])
     command[first + 20] = np.nan
-    trials = cut(dataclasses.replace(hidden.recording, command=command), "robot", hidden.spec.joints)
+    trials = cut(dataclasses.replace(hidden.recording, command=command), "robot", hidden.spec)
     assert len(trials) == len(whole)
     assert np.isfinite(trials.measured[0, :, 0, 0]).sum() == 20
     assert trials.left_out == (f"at {first * 0.02:.2f} s: no command is known from {first * 0.02 + 0.4:.2f} s on",)
+
+
+def test_a_motion_ends_before_a_joint_comes_to_its_limit_and_none_begins_there(hidden):
+    """What the limit does to the joint there says nothing of the robot that is looked for."""
+    whole = cut(hidden.recording, "robot", hidden.spec)
+    begin, end = (round(each / hidden.recording.period) for each in whole.begins[1:3])
+    position = hidden.recording.position.copy()
+    position[begin + 30 : end + 1, 1] = hidden.spec.position_limit[1, 1] + 0.03
+    trials = cut(dataclasses.replace(hidden.recording, position=position), "robot", hidden.spec)
+    assert list(trials.begins) == [each for each in whole.begins if each != whole.begins[2]]
+    assert np.isfinite(trials.measured[0, :, 1, 0]).sum() == 29
+    said = [f"at {whole.begins[1]:.2f} s: a joint is at its limit from {whole.begins[1] + 0.6:.2f} s on"]
+    assert trials.left_out[:1] == tuple(said)
 
 
 def test_of_a_long_recording_motions_from_all_over_it_are_used(hidden):
     again = {
         key: np.tile(getattr(hidden.recording, key), (15, 1)) for key in ("position", "velocity", "command", "effort")
     }
-    trials = cut(dataclasses.replace(hidden.recording, **again), "robot", hidden.spec.joints)
+    trials = cut(dataclasses.replace(hidden.recording, **again), "robot", hidden.spec)
     assert len(trials) == 40
     assert "all but 40 of" in trials.left_out[-1]
 
@@ -177,7 +190,7 @@ def test_motions_that_tell_nothing_are_refused_in_one_line(hidden, change, line)
         cut(
             Recording(recording.period, position, recording.velocity, command, recording.effort),
             "robot",
-            hidden.spec.joints,
+            hidden.spec,
         )
     assert len(str(caught.value).splitlines()) == 1
 

@@ -10,6 +10,7 @@ import pytest
 
 from physai.identify.recording import read
 from physai.identify.trials import cut
+from physai.robots import RobotSpec
 from tests.ros.peer import TOPIC
 
 # An arm that is driven may not be late, as it is where other tests start their processes on the same two cores.
@@ -30,6 +31,11 @@ def excite(start, start_robot, policy_path, tmp_path):
     return excite
 
 
+@pytest.fixture(scope="module")
+def robot(reacher):
+    return RobotSpec.from_config(reacher.robot)
+
+
 def recorded(folder: Path):
     # The virtual robot tells of itself 100 times a second.
     return read(folder, JOINTS, 0.01, TOPIC)
@@ -37,11 +43,11 @@ def recorded(folder: Path):
 
 @pytest.mark.slow
 @drives
-def test_motions_are_recorded_within_bounds_and_end_at_home_at_rest(excite, peer, tmp_path):
+def test_motions_are_recorded_within_bounds_and_end_at_home_at_rest(excite, peer, robot, tmp_path):
     process = excite()
     assert process.wait(60) == 0, process.output
     data = recorded(tmp_path / "recording")
-    trials = cut(data, "it", JOINTS)
+    trials = cut(data, "it", robot)
     said = re.search(r"(\d+) of (\d+) motions, (\d+) broken off", process.output)
     assert said, process.output
     begun, count, broken_off = map(int, said.groups())
@@ -102,7 +108,7 @@ def test_a_stop_for_good_ends_it_with_the_reason_and_zeros(excite, peer, tmp_pat
 
 @pytest.mark.slow
 @drives
-def test_a_moment_of_silence_breaks_off_a_motion_and_the_others_follow(excite, peer, tmp_path):
+def test_a_moment_of_silence_breaks_off_a_motion_and_the_others_follow(excite, peer, robot, tmp_path):
     process = excite()
     process.says("motion 1 of", 60.0)
     peer.moved(after=time.monotonic())
@@ -111,7 +117,7 @@ def test_a_moment_of_silence_breaks_off_a_motion_and_the_others_follow(excite, p
     peer.set_parameters("/virtual_robot", fault_stop=False)
     assert process.wait(60) == 0, process.output
     assert re.search(r"[12] broken off", process.output), process.output  # one more by a stall of the computer
-    assert len(cut(recorded(tmp_path / "recording"), "it", JOINTS)) >= 1
+    assert len(cut(recorded(tmp_path / "recording"), "it", robot)) >= 1
 
 
 @pytest.mark.slow
