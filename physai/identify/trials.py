@@ -139,7 +139,7 @@ class _Begin:
 def _motions(recording: Recording, limits: np.ndarray) -> tuple[list[_Motion], list[str]]:
     """Find the motions, and say what of the recording is left out."""
     lowest, highest = limits[:, 0] + _OFF_LIMITS, limits[:, 1] - _OFF_LIMITS
-    at_limit: np.ndarray = ((recording.position < lowest) | (recording.position > highest)).any(axis=1)
+    at_limit = np.any((recording.position < lowest) | (recording.position > highest), axis=1)
     known = np.isfinite(recording.command).all(axis=1)
     changed = np.ones(len(recording), dtype=bool)
     changed[1:] = ~(known[1:] & known[:-1]) | (recording.command[1:] != recording.command[:-1]).any(axis=1)
