@@ -18,7 +18,7 @@ from physai.robots import RobotSpec
 from physai.targets import make
 
 _STEP = 1e-3  # units, over which slopes are taken
-_FIRST, _MORE, _LAST = 6, 15, 40  # evaluations from each start, from the best, and from the last two
+_FIRST, _MORE, _LAST = 6, 15, 40  # evaluations from each start, from the best, and from the last ones
 _STARTS = 3
 _CLOSE = 2.0  # times the best cost, up to which the second best may yet become the best
 _DOUBT = 3.0  # times the errors of most motions, beyond which an error counts by its size, and not by its square
@@ -204,10 +204,11 @@ def fit(predict: Predictor, trials: Trials, unknowns: Unknowns, longest: int, se
             break
     others = [each for each in sorted(found, key=_cost)[:2] if each[1] != at and _cost(each) < _CLOSE * best.cost]
     finalists = [(best.x, at), *((result.x, delay) for result, delay in others)]
-    no_stronger = best.x.copy()
-    no_stronger[: len(shown)] = np.where(shown == 0.0, best.x[: len(shown)], np.minimum(best.x[: len(shown)], shown))
-    if (no_stronger != best.x).any():  # a limit that is never reached may be too high
-        finalists.append((no_stronger, at))
+    limits = np.array([label.startswith("effort_limit") for label in unknowns.labels])
+    if (best.x[: len(shown)][limits] > shown[limits]).any():  # one that is never reached may be too high
+        lower = best.x.copy()
+        lower[: len(shown)][limits] = np.minimum(lower[: len(shown)], shown)[limits]
+        finalists.append((lower, at))
     problem.trust()
     best, at = min((problem.solve(begin, delay, _LAST) for begin, delay in finalists), key=_cost)
     for way in (-_PART, _PART):
@@ -258,10 +259,10 @@ class _Problem:
         From a limit that no motor of the prediction reaches, no slope leads to the one that the robot's motors reached.
         """
         described = self._unknowns.parameters(np.zeros((1, len(self._unknowns))))[0]
-        effort = np.abs(self._trials.measured[2])
-        felt = np.isfinite(effort).any(axis=(0, 1))
+        effort = self._trials.measured[2]
+        largest = np.where(np.isfinite(effort), np.abs(effort), 0.0).max(axis=(0, 1))
         limit = described[self._predict.effort_limit]  # a view
-        limit[felt] = np.nanmax(effort[:, :, felt], axis=(0, 1))
+        limit[largest > 0.0] = largest[largest > 0.0]
         return self._unknowns.coordinates(described)
 
     def inside(self, coordinates: np.ndarray) -> np.ndarray:
@@ -319,12 +320,12 @@ class _Problem:
         """Leave out motions whose errors are far beyond those of most; return whether there are any, and not many."""
         errors = self._of_motions(result, delay)
         kept = self._kept & (errors < _SPOILT * max(1.0, float(np.median(errors[self._kept]))))
-        if kept.all() or (kept == self._kept).all() or (~kept).sum() > _MOST_SPOILT * len(kept):
+        fitted, held_out = self._fitted & kept[:, None], self._held_out & kept[:, None]
+        few = (~kept).sum() <= _MOST_SPOILT * len(kept) and fitted.any() and held_out.any()
+        if (kept == self._kept).all() or not few:
             return False
-        self._kept = kept
-        self._fitted &= kept[:, None]
-        self._held_out &= kept[:, None]
-        return bool(self._fitted.any() and self._held_out.any())
+        self._kept, self._fitted, self._held_out = kept, fitted, held_out
+        return True
 
     def solve(self, start: np.ndarray, delay: float, evaluations: int) -> tuple[OptimizeResult, float]:
         """Go downhill from somewhere, with a given delay."""

@@ -20,8 +20,9 @@ _SHOWS = 3.0  # standard deviations, from which an acceleration does
 _FEWEST, _MOST = 2, 40  # motions: one to learn from, one to judge by; and more hardly tell more
 _LEAST_NOISE = np.array([1e-5, 1e-4])  # rad, rad/s; encoders resolve no more
 _LEAST_SHARE = 0.01  # of the largest effort, to which it is known: sensors of torque have errors of scale, too
-_OFF_LIMITS = 0.01  # rad from the limits of joints, within which a motion ends: what a limit does is not looked for
-_PART_HELD_OUT = 4  # one of so many motions
+_NEAR_LIMIT = 0.05  # rad; zeros of encoders may be off by as much
+_BEYOND_LIMIT = 0.02  # rad, by which a joint that begins at its limit may be beyond it
+_HELD_OUT = 4  # one of so many motions
 _LEAST_MOTION = 20.0  # times the noise of positions, that each joint must move in some trial
 
 
@@ -58,17 +59,19 @@ class Trials:
 
     @property
     def held_out(self) -> np.ndarray:
-        """The motions by which a fit is judged, [B]: a quarter, of those in which the fewest joints are at their best.
+        """Whether each motion is one by which a fit is judged, [B]: a quarter of them, spread over the recording.
 
-        How strong a motor is may show in one motion only, and that one is needed to find it.
+        What shows only at high velocities and efforts, such as how strong a motor is, may show in one motion only. So
+        they are chosen among those in which the fewest joints reach their largest velocity or effort.
         """
-        peaks = np.abs(np.nan_to_num(self.measured[1:])).max(axis=1)  # [2, B, n]
-        measured = peaks.max(axis=1) > 0.0
-        needed = np.bincount(peaks.argmax(axis=1)[measured], minlength=len(self))
-        others = np.flatnonzero(needed == needed.min())
-        count = min(max(1, len(self) // _PART_HELD_OUT), len(others))
-        chosen = others[((np.arange(count) + 0.5) * len(others) / count).astype(int)]
-        return np.isin(np.arange(len(self)), chosen)
+        sizes = np.where(np.isfinite(self.measured[1:]), np.abs(self.measured[1:]), 0.0).max(axis=1)  # [2, B, n]
+        shown = sizes.max(axis=1) > 0.0
+        largest = np.bincount(sizes.argmax(axis=1)[shown], minlength=len(self))
+        count = max(1, len(self) // _HELD_OUT)
+        others = np.flatnonzero(largest <= np.sort(largest)[count - 1])
+        held_out = np.zeros(len(self), dtype=bool)
+        held_out[others[((np.arange(count) + 0.5) * len(others) / count).astype(int)]] = True
+        return held_out
 
 
 def cut(recording: Recording, name: str, spec: RobotSpec) -> Trials:
@@ -83,7 +86,7 @@ def cut(recording: Recording, name: str, spec: RobotSpec) -> Trials:
         UserError: If there are no two such motions, or a joint hardly moves in them.
     """
     joints = spec.joints
-    motions, left_out = _motions(recording, spec.position_limit)
+    motions, left_out = _motions(recording, spec)
     if len(motions) < _FEWEST:
         raise UserError(
             f"{name}: {len(motions)} motions begin at rest or at a steady speed, and at least {_FEWEST} are needed: "
@@ -136,10 +139,8 @@ class _Begin:
     degrees: np.ndarray  # of freedom of these, [2]
 
 
-def _motions(recording: Recording, limits: np.ndarray) -> tuple[list[_Motion], list[str]]:
+def _motions(recording: Recording, spec: RobotSpec) -> tuple[list[_Motion], list[str]]:
     """Find the motions, and say what of the recording is left out."""
-    lowest, highest = limits[:, 0] + _OFF_LIMITS, limits[:, 1] - _OFF_LIMITS
-    at_limit = np.any((recording.position < lowest) | (recording.position > highest), axis=1)
     known = np.isfinite(recording.command).all(axis=1)
     changed = np.ones(len(recording), dtype=bool)
     changed[1:] = ~(known[1:] & known[:-1]) | (recording.command[1:] != recording.command[:-1]).any(axis=1)
@@ -156,10 +157,11 @@ def _motions(recording: Recording, limits: np.ndarray) -> tuple[list[_Motion], l
         if len(unknown):
             last = first + int(unknown[0])
             left_out.append(f"{at}: no command is known from {last * recording.period:.2f} s on")
-        reached = first + np.flatnonzero(at_limit[first : last + 1])
-        if len(reached):
-            last = max(int(reached[0]) - 1, first)
-            left_out.append(f"{at}: a joint is at its limit from {reached[0] * recording.period:.2f} s on")
+        free, joint = _free_of_limits(recording.position[first : last + 1], spec.position_limit)
+        if joint is not None:
+            last = max(first + free - 1, first)
+            end = f"'{spec.joints[joint]}' comes to its limit at {(first + free) * recording.period:.2f} s"
+            left_out.append(f"{at}: {end}, and nothing is used from there on")
         measured = _measured(recording)[:, first - mean + 1 : first + 1]
         known_at = np.isfinite(measured).all(axis=(0, 2))
         if last - first < shortest:
@@ -173,6 +175,23 @@ def _motions(recording: Recording, limits: np.ndarray) -> tuple[list[_Motion], l
             else:
                 motions.append(_Motion(first, last, begin))
     return motions, left_out
+
+
+def _free_of_limits(position: np.ndarray, limits: np.ndarray) -> tuple[int, int | None]:
+    """Return for how many steps of a motion no joint comes to a limit, and which one then does.
+
+    What a limit does to a joint says nothing of the robot that is looked for. A joint that rests at its limit when the
+    motion begins may leave it.
+
+    Args:
+        position: Of the joints, rad, [k, n].
+        limits: Lower and upper ones, rad, [n, 2].
+    """
+    beyond = np.maximum(limits[:, 0] - position, position - limits[:, 1])
+    near = beyond > -_NEAR_LIMIT
+    comes = (near & np.logical_or.accumulate(~near & np.isfinite(position))) | (beyond > _BEYOND_LIMIT)
+    steps = np.flatnonzero(comes.any(axis=1))
+    return (int(steps[0]), int(comes[steps[0]].argmax())) if len(steps) else (len(position), None)
 
 
 def _begin(measured: np.ndarray, time: np.ndarray) -> _Begin | str:

@@ -6,7 +6,8 @@ FASTEST = 100.0  # rad/s; PyBullet lets no joint turn faster, before and after t
 _ERP = 0.2  # share of the way back to its limit that a joint goes in one substep
 # A joint that is farther beyond its limit is stopped, and not pushed back (Bullet's split impulse).
 _DEEPEST = 0.04  # rad
-_BRAKES = 25.0  # rad/s²; about what motors of arms brake with at most
+# Friction adds to a motor that brakes as hard for a whole step, and in part where it does so for a part of the step.
+_FULL_BRAKING = 25.0  # rad/s²
 _ROUNDS, _TOGETHER = 100, 10
 _EXACT = 1e-9  # rad/s, and a share of the impulses
 
@@ -43,21 +44,22 @@ def motor_velocity(
 def motor_effort(
     limit: np.ndarray, friction: np.ndarray, command: np.ndarray, velocity: np.ndarray, dt: float
 ) -> np.ndarray:
-    """Return the largest efforts that motors have left, N·m, where dry friction takes its share or helps, [N, n].
+    """Return the largest efforts of motors, N·m, which Coulomb friction makes smaller or larger, [N, n].
 
-    PyBullet's motors know of no such friction. It takes from a motor that speeds a joint up, and adds to one that
-    brakes, for as much of the step as that lasts: a slow joint soon stands, and speeds up the other way. So what no
-    encoder sees of a velocity does not decide where a robot goes.
+    PyBullet's motors have no such friction. It takes from a motor that accelerates a joint, and adds to one that brakes
+    it. It adds in proportion to the velocity, or to what of it is too much, until all of it adds: a velocity too small
+    to be measured changes little.
 
     Args:
-        limit: Largest efforts of the motors, N·m, [N, n].
+        limit: Largest efforts without friction, N·m, [N, n].
         friction: Of the joints, N·m, [N, n].
         command: Velocities that the motors aim at, rad/s, [N, n].
         velocity: Of the joints, rad/s, [N, n].
         dt: Control period, s.
     """
-    brakes = np.where((command - velocity) * velocity < 0.0, np.minimum(np.abs(velocity) / (_BRAKES * dt), 1.0), 0.0)
-    return np.maximum(limit - (1.0 - 2.0 * brakes) * friction, 0.0)
+    # Twice the smaller of velocity and missing velocity where one is against the other, and 0 elsewhere.
+    braking = np.abs(velocity) + np.abs(command - velocity) - np.abs(command)
+    return np.maximum(limit - friction + np.minimum(braking / (_FULL_BRAKING * dt), 2.0) * friction, 0.0)
 
 
 def limit_velocity(beyond: np.ndarray, dt: float) -> np.ndarray:

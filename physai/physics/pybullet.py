@@ -50,9 +50,9 @@ class PyBulletPhysics:
     contacts is no part of the state: with a floating base, a restored robot goes on as before, but not to the last bit.
 
     Joints that are springs (``servo`` of the robot) are given their effort once a substep. Elsewhere each joint
-    is driven by PyBullet's velocity motor with a limited effort; where the robot takes positions, a servo
-    tells the motor how fast to go, once a control period. Of its effort, dry
-    friction takes its share (:func:`physai.physics.impulse.motor_effort`).
+    is driven by PyBullet's velocity motor with a limited effort, of which Coulomb friction takes its share
+    (:func:`physai.physics.impulse.motor_effort`); where the robot takes positions, a servo tells the motor how fast to
+    go, once a control period.
 
     Args:
         spec: The robot.
@@ -169,13 +169,13 @@ class PyBulletPhysics:
             command = np.clip(self._spec.position_gain * to_go, -fastest, fastest)
         limit, friction = self._parameters["effort_limit"], self._parameters["joint_friction"]
         velocity = np.array(self._velocity).reshape(expected)
-        effort = motor_effort(limit, friction, command, velocity, self._control_dt)
-        self._advance(command.ravel().tolist(), effort.ravel().tolist())
+        largest = motor_effort(limit, friction, command, velocity, self._control_dt)
+        self._advance(command.ravel().tolist(), largest.ravel().tolist())
         return self.robot_state()
 
-    def _advance(self, targets: list[float], largest: list[float]) -> None:
+    def _advance(self, targets: list[float], largest_efforts: list[float]) -> None:
         # One flat pass over all joints of all robots: this loop is what collection costs most.
-        commands = zip(self._motors, targets, largest, strict=True)
+        commands = zip(self._motors, targets, largest_efforts, strict=True)
         command, step, read = bullet.setJointMotorControl2, bullet.stepSimulation, bullet.getJointStates
         mode, joints = bullet.VELOCITY_CONTROL, self._joints
         positions: list[float] = []
@@ -184,8 +184,8 @@ class PyBulletPhysics:
         for world in self._worlds:
             client = world.client
             motors = islice(commands, len(world.bodies) * len(joints))
-            for (body, joint, gain), target, effort in motors:
-                command(body, joint, mode, 0.0, target, effort, 0.1, gain, 0.0, client)
+            for (body, joint, gain), target, largest in motors:
+                command(body, joint, mode, 0.0, target, largest, 0.1, gain, 0.0, client)
             for _ in range(self.substeps):
                 step(client)
             for body in world.bodies:

@@ -140,7 +140,7 @@ def test_with_efforts_the_scale_of_masses_and_effort_limits_is_found(env_config,
 
 
 @pytest.mark.slow
-def test_an_effort_limit_that_few_motions_reach_is_found_from_one_that_none_would(env_config, strong):
+def test_an_effort_limit_is_found_from_a_higher_one_that_no_motion_reaches(env_config, strong):
     """No slope leads there from the description's limit; from the largest effort that was measured, one does."""
     config = env_config("reacher", "physics=mujoco")
     names = [*ALL, "effort_limit"]

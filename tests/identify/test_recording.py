@@ -95,11 +95,23 @@ def test_motions_begin_where_commands_change_after_a_rest(hidden):
 
 def test_the_motion_in_which_a_motor_was_strongest_is_not_held_out(hidden):
     trials = cut(hidden.recording, "robot", hidden.spec)
-    assert trials.held_out.sum() == max(1, len(trials) // 4)
+    assert trials.held_out.sum() == 1
     for number in range(len(trials)):
         measured = trials.measured.copy()
         measured[2] = np.arange(len(trials))[:, None] == number
         assert not dataclasses.replace(trials, measured=measured).held_out[number]
+
+
+@pytest.mark.parametrize(("motions", "joints"), [(2, 1), (2, 7), (5, 7), (8, 7), (40, 2)])
+@pytest.mark.parametrize("told", [0, 1, 2], ids=["nothing", "velocities", "efforts, too"])
+def test_a_quarter_is_held_out_and_one_motion_at_least_however_few_there_are(hidden, motions, joints, told):
+    random, trials = np.random.default_rng(motions), cut(hidden.recording, "robot", hidden.spec)
+    measured = random.normal(size=(3, 10, motions, joints))
+    measured[1 + told :] = np.nan
+    anywhere = np.zeros((motions, joints))
+    held_out = dataclasses.replace(trials, measured=measured, start=anywhere).held_out
+    assert held_out.sum() == max(1, motions // 4)
+    assert not held_out.all()
 
 
 def moving_before(hidden, speed, told):
@@ -154,17 +166,28 @@ def test_a_motion_ends_where_a_command_is_not_known_and_it_is_said(hidden):
     assert trials.left_out == (f"at {first * 0.02:.2f} s: no command is known from {first * 0.02 + 0.4:.2f} s on",)
 
 
-def test_a_motion_ends_before_a_joint_comes_to_its_limit_and_none_begins_there(hidden):
+@pytest.mark.parametrize("side", [0, 1])
+def test_a_motion_ends_before_a_joint_comes_to_its_limit_and_none_begins_beyond_it(hidden, side):
     """What the limit does to the joint there says nothing of the robot that is looked for."""
     whole = cut(hidden.recording, "robot", hidden.spec)
     begin, end = (round(each / hidden.recording.period) for each in whole.begins[1:3])
     position = hidden.recording.position.copy()
-    position[begin + 30 : end + 1, 1] = hidden.spec.position_limit[1, 1] + 0.03
+    position[begin + 30 : end + 1, 1] = 1.02 * hidden.spec.position_limit[1, side]
+    position[begin + 31] = np.nan
     trials = cut(dataclasses.replace(hidden.recording, position=position), "robot", hidden.spec)
     assert list(trials.begins) == [each for each in whole.begins if each != whole.begins[2]]
     assert np.isfinite(trials.measured[0, :, 1, 0]).sum() == 29
-    said = [f"at {whole.begins[1]:.2f} s: a joint is at its limit from {whole.begins[1] + 0.6:.2f} s on"]
-    assert trials.left_out[:1] == tuple(said)
+    at, until, last = whole.begins[1], whole.begins[1] + 0.6, whole.begins[2]
+    comes = "at {:.2f} s: 'joint2' comes to its limit at {:.2f} s, and nothing is used from there on"
+    assert trials.left_out == (comes.format(at, until), comes.format(last, last), f"at {last:.2f} s: too short")
+
+
+def test_a_joint_may_leave_a_limit_at_which_it_rests(hidden):
+    whole = cut(hidden.recording, "robot", hidden.spec)
+    at, position = whole.start[0, 1], hidden.recording.position.copy()
+    position[:, 1] = at + np.abs(position[:, 1] - at)
+    rests = dataclasses.replace(hidden.spec, position_limit=np.array([[-np.inf, np.inf], [at, np.inf]]))
+    assert cut(dataclasses.replace(hidden.recording, position=position), "robot", rests).begins[0] == whole.begins[0]
 
 
 def test_of_a_long_recording_motions_from_all_over_it_are_used(hidden):

@@ -43,11 +43,18 @@ def test_a_limit_holds_against_any_motor_and_only_pushes_away_from_itself():
     assert (weak[2] < -4).all()
 
 
-def test_friction_helps_a_motor_for_as_much_of_a_step_as_it_brakes():
+def test_friction_adds_to_a_motor_for_as_much_of_a_step_as_it_brakes():
     velocity = np.array([[2.0, 0.5, 0.25, 1e-9, 0.0, -2.0, 2.0]])
     command = np.array([[-1.0, -1.0, -1.0, -1.0, -1.0, -3.0, 0.5]])
     found = motor_effort(np.full((1, 7), 3.0), np.full((1, 7), 1.0), command, velocity, 0.02)
     np.testing.assert_allclose(found, [[4.0, 4.0, 3.0, 2.0, 2.0, 2.0, 4.0]], atol=1e-6)
+
+
+def test_what_rounding_leaves_of_a_missing_velocity_changes_no_effort():
+    velocity = np.full((1, 3), 2.0)
+    command = velocity + np.array([[-1e-12, 0.0, 1e-12]])
+    found = motor_effort(np.full((1, 3), 3.0), np.full((1, 3), 1.0), command, velocity, 0.02)
+    np.testing.assert_allclose(found, 2.0, atol=1e-9)
 
 
 def test_a_motor_that_is_too_weak_for_the_friction_gives_nothing():

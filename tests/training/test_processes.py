@@ -43,6 +43,7 @@ class Run:
         # A process group, as a terminal makes.
         self.process = command("train", *arguments, cwd=self.folder)
         wait_while_runs(self.process, lambda: self._has_learnt(log, before, saved), 120)
+        assert self.process.poll() is None, self.process.communicate()[0]
         self.everybody = descendants(self.process.pid)
         is_ray = self.collector == "ray"
         self.workers = {one for one in self.everybody if not is_ray or "WorkerCollector" in command_of(one)}
