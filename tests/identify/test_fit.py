@@ -152,22 +152,36 @@ def test_an_effort_limit_is_found_from_a_higher_one_that_no_motion_reaches(env_c
     assert (result.after < 1.2 * NOISE[0]).all()
 
 
+def spoilt(hidden, number):
+    """It is said that the commands of a motion came sooner than they did."""
+    recording = hidden.recording
+    first = round(cut(recording, "robot", hidden.spec).begins[number] / recording.period)
+    command = recording.command.copy()
+    command[first : first + 60] = recording.command[first + 6 : first + 66]
+    return dataclasses.replace(hidden, recording=dataclasses.replace(recording, command=command))
+
+
 @pytest.mark.slow
 def test_motions_in_which_commands_came_late_are_left_out_and_named(env_config, strong):
     config = env_config("reacher", "physics=mujoco")
     hidden = record(config, strong, ["velocity_gain"], 20.0, 2)
-    recording = hidden.recording
-    trials = cut(recording, "robot", hidden.spec)
-    first = round(trials.begins[1] / recording.period)
-    command = recording.command.copy()
-    command[first : first + 60] = recording.command[first + 6 : first + 66]  # it is said that they came sooner
-    spoilt = dataclasses.replace(hidden, recording=dataclasses.replace(recording, command=command))
-    result = found(spoilt, config, ["velocity_gain", "joint_damping"])
+    result = found(spoilt(hidden, 1), config, ["velocity_gain", "joint_damping"])
     assert result.spoilt == (1,)
     assert result.delay == hidden.delay
     assert result.explained
     truth = hidden.parameters[hidden.layout.columns["velocity_gain"]]
     np.testing.assert_allclose(result.values[:2], truth, atol=0.02)
+
+
+@pytest.mark.slow
+def test_the_only_motion_by_which_a_fit_is_judged_is_not_left_out(env_config, strong):
+    config = env_config("reacher", "physics=mujoco")
+    hidden = record(config, strong, ["velocity_gain"], 12.0, 2)
+    held_out = np.flatnonzero(cut(hidden.recording, "robot", hidden.spec).held_out)
+    assert len(held_out) == 1
+    result = found(spoilt(hidden, held_out[0]), config, ["velocity_gain"])
+    assert result.spoilt == ()
+    assert not result.explained
 
 
 def test_delays_are_tried_as_long_as_one_near_the_best_is_better():
