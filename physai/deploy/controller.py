@@ -123,8 +123,9 @@ class Controller:
         passed, stop = self._take_time(now, reasons)
         if goal is not None:
             self._take_goal(goal, reasons)
-        if self._command.state is State.ACTIVE and not stop:
-            self._following.commanded(now, self._interface.way(passed))
+        if self._command.state in (State.ACTIVE, State.REACHED) and not stop:
+            rests = self._command.state is State.REACHED
+            self._following.commanded(now, self._interface.way(passed), rests)
         else:
             self._following.restart()
         if joint_state is not None and math.isfinite(now):

@@ -72,8 +72,13 @@ class Following:
         self._rows, self._sample_at = 0, -math.inf  # of measurements, and when the last of them was taken
         self._commanded[:] = 0.0
 
-    def commanded(self, now: float, way: np.ndarray) -> None:
-        """Take how far each joint was told to go, [n] rad, until a time, s, since the last such time."""
+    def commanded(self, now: float, way: np.ndarray, rests: bool = False) -> None:
+        """Take how far each joint was told to go, [n] rad, until a time, s, since the last such time.
+
+        Of an arm that rests at its goal, what is measured is forgotten. What was commanded is not: a late arm moves on.
+        """
+        if rests:
+            self._rows, self._sample_at = 0, -math.inf
         if not self._begun:
             self._begun = True
             self._start = self._at = now

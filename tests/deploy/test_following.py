@@ -172,6 +172,19 @@ def test_an_arm_that_follows_late_and_noisily_is_no_fault(policy, speed, delay):
         assert {command.state for command in commands} <= {State.ACTIVE, State.REACHED}
 
 
+def test_an_arm_that_follows_late_may_turn_round_when_it_has_hardly_rested(policy):
+    """It still does what it was told before it was at its goal."""
+    following, late = Following(policy.metadata, ControllerConfig()), deque([0.0] * 8)
+    position = 0.0
+    for step in range(100):
+        resting = 50 <= step < 52
+        speed = 0.0 if resting else -1.0 if step < 50 else 0.2
+        following.commanded(0.02 * step, np.full(2, 0.02 * speed), rests=resting)
+        late.append(speed)
+        position += 0.02 * (moving := late.popleft())
+        assert following.heard(0.02 * step + 0.001, np.array([position] * 2 + [moving] * 2)) is None
+
+
 def test_an_arm_that_follows_is_no_fault_though_every_second_state_is_refused(policy):
     arm, states = Arm(policy), count()
     arm.show = lambda velocity, **values: values | {"velocity": velocity if next(states) % 2 else (math.nan, 0.0)}
