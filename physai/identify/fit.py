@@ -211,10 +211,13 @@ def fit(predict: Predictor, trials: Trials, unknowns: Unknowns, longest: int, se
         finalists.append((lower, at))
     problem.trust()
     best, at = min((problem.solve(begin, delay, _LAST) for begin, delay in finalists), key=_cost)
+    whole = at
     for way in (-_PART, _PART):
         while at + way >= 0 and _cost(better := problem.solve(best.x, at + way, _FIRST)) < best.cost:
             best, at = better
             told(f"delay of {at / predict.per_control_step:g} steps: {best.cost:.4g}")
+    if at != whole:
+        best, at = problem.solve(best.x, at, _LAST)
     return problem.judge(best, at)
 
 
