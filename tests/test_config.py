@@ -17,7 +17,7 @@ from physai.training.agent import Agent
 from physai.training.config import TrainConfig
 from tests.composed import composed
 
-SMALL = ("collector.num_envs=4", "collector.frames_per_batch=64")
+SMALL = ("collector=single", "collector.num_envs=4", "collector.frames_per_batch=64")
 
 
 def choices(group: str) -> list[str]:
@@ -25,10 +25,16 @@ def choices(group: str) -> list[str]:
 
 
 @cache
+def chosen(group: str, choice: str) -> dict[str, str]:
+    """What else is chosen with a choice, by group."""
+    return dict(compose("train", [f"{group}={choice}"], hydra=True).hydra.runtime.choices)
+
+
+@cache
 def algorithm_of(policy: str) -> str:
     """The first algorithm that brings these networks along; PPO takes the others."""
     for name in choices("algo"):
-        if compose("train", [f"algo={name}"], hydra=True).hydra.runtime.choices.policy == policy:
+        if chosen("algo", name)["policy"] == policy:
             return f"algo={name}"
     return "algo=ppo"
 
@@ -37,7 +43,7 @@ def algorithm_of(policy: str) -> str:
 def env_with(group: str, choice: str) -> str:
     """The first environment that has this robot or task; the reacher's takes others."""
     for name in choices("env"):
-        if compose("train", [f"env={name}"], hydra=True).hydra.runtime.choices[group] == choice:
+        if chosen("env", name)[group] == choice:
             return f"env={name}"
     return "env=reacher"
 

@@ -1,5 +1,7 @@
 """Algorithms race against Stable-Baselines3's."""
 
+from dataclasses import replace
+
 import pytest
 from rich.console import Console
 
@@ -31,7 +33,8 @@ def test_algorithms_race(monkeypatch):
     monkeypatch.setattr(algorithms, "ALGORITHMS", ("a2c", "td3"))
     monkeypatch.setattr(algorithms, "GOALS", 20)
     monkeypatch.setattr("physai.bench.training.JUDGE_EVERY", 256)
-    reacher = algorithms.reacher
+    as_it_comes, reacher = algorithms.sb3.as_it_comes, algorithms.reacher
+    monkeypatch.setattr(algorithms.sb3, "as_it_comes", lambda name: replace(as_it_comes(name), frames=256))
     short = ("env.task.max_steps=10", "total_frames=1280")
     monkeypatch.setattr(algorithms, "reacher", lambda seed, *overrides: reacher(seed, *overrides, *short))
     races = algorithms.measure_algorithms(seed=0, peer_seconds=0.1)

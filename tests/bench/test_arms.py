@@ -75,8 +75,9 @@ def test_it_learns_with_goals_in_hindsight():
 
 
 @pytest.mark.slow
-def test_arms_race_in_processes_of_their_own(monkeypatch):
-    """As in the real race, with less of everything; panda-gym's robot among them."""
+def test_arms_race(monkeypatch):
+    """As in the real race, with less of everything, in one process; panda-gym's robot among them."""
+    monkeypatch.setattr(arms, "apart", lambda race, *arguments: race(*arguments))  # tests/bench/test_training.py
     monkeypatch.setattr(arms, "OURS", {"physai": ()})
     monkeypatch.setattr(arms, "PEERS", {name: arms.PEERS[name] for name in arms.PEERS if "PPO" not in name})
     races = arms.measure_arms(0, times=0.01, goals=10, overrides=("env.task.max_steps=10", "total_frames=2048"))

@@ -8,14 +8,14 @@ from physai.bench import engines
 
 @pytest.mark.slow
 def test_every_engine_is_timed_with_every_arm_and_shown(monkeypatch):
-    monkeypatch.setattr(engines, "ROBOTS", (1, 4))
+    monkeypatch.setattr(engines, "ROBOTS", (2,))
     monkeypatch.setattr(engines, "ROUNDS", 1)
     monkeypatch.setattr(engines, "ROBOT_STEPS", 8)
     speeds = engines.measure_engines(seed=0)
-    assert set(speeds) == {(arm, robots) for arm in engines.ARMS for robots in (1, 4)}
+    assert set(speeds) == {(arm, robots) for arm in engines.ARMS for robots in (2,)}
     assert all(len(sides) == len(engines.ENGINES) and min(sides) > 0 for sides in speeds.values())
     console = Console(width=160, record=True)
     console.print(engines.engines_table(speeds))
     shown = console.export_text()
-    for part in (*engines.ENGINES, "KUKA, 7 joints, 4"):
+    for part in (*engines.ENGINES, "KUKA, 7 joints, 2"):
         assert part in shown

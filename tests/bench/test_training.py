@@ -13,6 +13,7 @@ from stable_baselines3.common.vec_env import VecCheckNan
 from torch.distributions import Distribution
 
 from physai.bench import rsl_rl, sb3, training
+from physai.bench.learner import THREADS, fastest_threads
 from physai.bench.sb3 import Learner, RobotVecEnv
 from physai.bench.training import Race, training_table
 from physai.envs.gym_env import RobotVectorEnv
@@ -140,6 +141,11 @@ def test_rsl_rl_learns_batch_by_batch(settings):
     learner.close()
 
 
+def test_the_threads_that_learn_fastest_are_chosen(capsys):
+    assert fastest_threads("rsl_rl", replace(rsl_rl.TUNED, robots=4)) in THREADS
+    assert "by torch threads" in capsys.readouterr().out
+
+
 def assert_learns(learner, frames):
     seen = [torch.zeros(3, size) for size in (8, 12)[: len(learner.in_keys)]]
     before = learner.act(*seen)
@@ -233,6 +239,8 @@ def test_who_does_not_arrive_is_ahead_of_nobody():
 @pytest.mark.slow
 def test_learners_race_in_processes_of_their_own(monkeypatch, capfd):
     """After JAX, whose threads no fork survives, physai still forks; and who is not here is left out by name."""
+    apart, chosen = training.apart, training._fastest_threads  # which learns, and JAX compiles for seconds
+    monkeypatch.setattr(training, "apart", lambda what, *given: 1 if what is chosen else apart(what, *given))
     peers = {name: training.PEERS[name] for name in ("SBX, tuned, physai's features",)}
     monkeypatch.setattr(training, "PEERS", peers | {"Nobody": ("no_such_package", "nobody", "NOTHING")})
     monkeypatch.setattr(training, "OURS", {"physai": ()})

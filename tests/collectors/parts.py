@@ -3,8 +3,11 @@
 import torch
 
 from physai.collectors import CollectorConfig, FrameSource, make_collector
-from physai.envs.make import TransformedRobotEnv, make
+from physai.config import validate
+from physai.envs.make import TransformedRobotEnv, make_env
 from physai.policies import GaussianActor
+from physai.training.config import TrainConfig
+from tests.composed import composed
 
 RAY = {"address": "local", "include_dashboard": False, "log_to_driver": False, "logging_level": "error"}
 KINDS = {
@@ -15,10 +18,11 @@ KINDS = {
     "ray": {"processes": 2, "sync": True, "ray_init": RAY},
 }
 CPU = torch.device("cpu")
+ENV = validate(TrainConfig, composed())  # composed before workers are forked, each of which would
 
 
 def robots(num_envs: int, seed: int) -> TransformedRobotEnv:
-    return make("reacher", num_envs, seed)
+    return make_env(ENV.env, ENV.randomization, ENV.normalization, num_envs, seed)
 
 
 def actor(std: float = 1.0) -> GaussianActor:

@@ -1,6 +1,5 @@
 import os
 import signal
-import subprocess
 import sys
 import time
 from itertools import pairwise
@@ -10,6 +9,9 @@ import torch
 
 from physai.errors import UserError
 from tests.collectors.parts import assert_equal
+from tests.docs.blocks import ROOT
+from tests.forge import Forked, forge_of
+from tests.training.small import IMPORTED
 from tests.waiting import wait_for
 
 
@@ -91,15 +93,6 @@ def test_a_killed_worker_ends_collection_with_an_error_and_takes_the_others_alon
     assert time.monotonic() - started < 20
 
 
-LEARNER = """
-import sys
-from tests.collectors import parts
-source = parts.source(sys.argv[1], parts.actor(), parts.robots(1, 0), 10**9)
-for _ in source:
-    print(*(process.pid for process in source.procs), flush=True)
-"""
-
-
 def is_alive(pid):
     try:
         with open(f"/proc/{pid}/stat") as file:
@@ -112,7 +105,7 @@ def is_alive(pid):
 @pytest.mark.skipif(sys.platform != "linux", reason="a signal at the death of the parent is Linux's")
 @pytest.mark.parametrize("kind", ["multi_sync", "multi_async"])
 def test_workers_die_with_a_learner_that_is_killed(kind):
-    learner = subprocess.Popen([sys.executable, "-c", LEARNER, kind], stdout=subprocess.PIPE, text=True)
+    learner = Forked(forge_of(*IMPORTED), "tests.collectors.learner", [kind], ROOT, os.environ)
     workers = []
     while len(workers) != 2:
         workers = [int(word) for word in learner.stdout.readline().split() if word.isdigit()]

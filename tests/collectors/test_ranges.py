@@ -4,16 +4,17 @@ import pytest
 import torch
 
 from physai.collectors import make_collector
-from physai.compose import compose
 from physai.config import validate
 from physai.envs.make import make_env
 from physai.training.config import TrainConfig
 from tests.collectors import parts
+from tests.composed import composed
+
+WIDE = validate(TrainConfig, composed("randomization=wide", "env.task.max_steps=8"))
 
 
 def robots(num_envs, seed):
-    config = validate(TrainConfig, compose("train", ["randomization=wide", "env.task.max_steps=8"]))
-    return make_env(config.env, config.randomization, config.normalization, num_envs, seed, pinned=0.5)
+    return make_env(WIDE.env, WIDE.randomization, WIDE.normalization, num_envs, seed, pinned=0.5)
 
 
 @pytest.mark.parametrize(

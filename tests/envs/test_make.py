@@ -5,7 +5,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
-from torchrl.envs import check_env_specs
+from torchrl.envs import TransformedEnv, check_env_specs
 
 import physai
 from physai.envs.robot_env import RobotEnv
@@ -73,6 +73,14 @@ def test_a_policy_that_is_being_learnt_can_drive_a_rollout(make_env):
 @parametrized
 def test_specs_hold(make_env, name, randomization):
     check_env_specs(make_env(name, randomization))
+
+
+@parametrized
+def test_a_step_of_zeros_is_the_one_that_torchrl_makes(make_env, name, randomization):
+    env = make_env(name, randomization)
+    ours, theirs = env.fake_tensordict(), TransformedEnv.fake_tensordict(env)
+    assert_equal(ours, theirs)
+    assert ours.batch_size == theirs.batch_size == ours["next"].batch_size
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -56,12 +56,12 @@ def small_config(*overrides: str) -> TrainConfig:
 
 
 # What every command imports, which takes longer than most of them run.
-_IMPORTED = ("physai.training.run", "physai.cli", "physai.algorithms", "physai.collectors", "physai.physics.pybullet")
+IMPORTED = ("physai.training.run", "physai.cli", "physai.algorithms", "physai.collectors", "physai.physics.pybullet")
 
 
 def command(module: str, *arguments: str, cwd: Path) -> Forked:
     """Start a physai command as a user would, in a process and a session of its own."""
-    return Forked(forge_of(*_IMPORTED), f"physai.{module}", arguments, cwd, os.environ | {"COLUMNS": "200"})
+    return Forked(forge_of(*IMPORTED), f"physai.{module}", arguments, cwd, os.environ | {"COLUMNS": "200"})
 
 
 def metrics(run: Path) -> list[dict[str, str]]:
