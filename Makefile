@@ -54,14 +54,15 @@ chromium:
 	  DEBIAN_FRONTEND=noninteractive apt-get install -qq -o Acquire::Retries=3 --yes --no-install-recommends chromium > /dev/null; }
 
 # The quick tests are one part: none of them measures time. A part of which ARGS choose no test (pytest's exit code 5) is
-# no failure.
+# no failure. Who keeps Python from storing what it compiles pays for it in each of the many processes here.
+test: export PYTHONDONTWRITEBYTECODE =
 test: $(VENV)/.installed-dev chromium  ## Run all tests (ARGS="-m 'not slow'" for the quick ones)
 	@export PHYSAI_TEST_RUNS=$$(mktemp -d); trap 'rm -rf "$$PHYSAI_TEST_RUNS"' EXIT; \
 	part() { echo "==> Testing $$1"; shift; $(BIN)/python -m pytest "$$@" $(ARGS) || [ $$? = 5 ]; }; \
 	if [ -n "$(findstring not slow,$(ARGS))" ]; then part "what is quick" -n 3 --dist worksteal --realtime=without; exit; fi; \
 	part "what is not ROS" -n 3 --dist worksteal --ignore tests/ros --realtime=without && \
 	part "ROS 2 nodes, which mostly wait, side by side" tests/ros -n 3 --dist worksteal --realtime=without && \
-	part "what measures time, two at a time and nothing else" tests/ros tests/bench -n 2 --dist worksteal --realtime=only
+	part "what measures time, three at a time and nothing else" tests/ros tests/bench -n 3 --dist worksteal --realtime=only
 
 bench: $(VENV)/.installed-dev  ## Measure speed against bare PyBullet, rclpy and Stable-Baselines3
 	@echo "==> Measuring (all of it takes several hours; ARGS=--collection and the like choose a part)"

@@ -5,7 +5,7 @@ import runpy
 import shutil
 import signal
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import redirect_stdout
 from functools import partial
 from pathlib import Path
@@ -178,9 +178,9 @@ def exported_run(once: Callable[[str, Callable[[Path], None]], Path]) -> Path:
 
 @pytest.fixture(scope="session")
 def position_run(once: Callable[[str, Callable[[Path], None]], Path]) -> Path:
-    """The same, of an arm that is driven by joint positions."""
-    command = "env.robot.command=joint_position"
-    return once("position_run", partial(_train_and_export, command, "total_frames=100_000"))
+    """The same, of an arm that is driven by joint positions, without policy.onnx."""
+    overrides = ("env.robot.command=joint_position", "total_frames=100_000")
+    return once("position_run", partial(_train_and_export, *overrides, formats=["torchscript"]))
 
 
 @pytest.fixture(scope="session")
@@ -204,9 +204,9 @@ def panda_run(once: Callable[[str, Callable[[Path], None]], Path]) -> Path:
 
 @pytest.fixture(scope="session")
 def walking_run(once: Callable[[str, Callable[[Path], None]], Path]) -> Path:
-    """A run of a robot on legs; short, for it walks from the first frame on."""
-    short = ("total_frames=12_288", "env.task.max_steps=100", "evaluation.goals=20")
-    return once("walking_run", partial(_train_and_export, "env=a1_walk", "physics=mujoco", *short))
+    """A run of a robot on legs, without policy.onnx; short, for it walks from the first frame on."""
+    overrides = ("env=a1_walk", "physics=mujoco", "total_frames=12_288", "env.task.max_steps=100", "evaluation.goals=20")
+    return once("walking_run", partial(_train_and_export, *overrides, formats=["torchscript"]))
 
 
 @pytest.fixture(scope="session")
@@ -215,7 +215,7 @@ def walking_policy(walking_run: Path) -> Policy:
     return load_policy(walking_run / "policy.pt")
 
 
-def _train_and_export(*arguments: Any) -> None:
+def _train_and_export(*arguments: Any, formats: Sequence[str] = ("torchscript", "onnx")) -> None:
     *overrides, run = arguments
     node = composed.composed(*overrides, "evaluation.episodes=200", "evaluation.in_a_row=2")
     (run / ".hydra").mkdir()
@@ -227,7 +227,7 @@ def _train_and_export(*arguments: Any) -> None:
     config = load_config(run)
     with pytest.MonkeyPatch.context() as patch, open(run / "export.txt", "w") as said, redirect_stdout(said):
         patch.setattr(module, "TRANSFER_EPISODES", 20 if config.env.robot.floating else 100)  # legs are slow there
-        export(run, "best", ["torchscript", "onnx"], config)
+        export(run, "best", list(formats), config)
 
 
 @pytest.fixture(scope="session")

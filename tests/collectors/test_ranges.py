@@ -24,12 +24,14 @@ def robots(num_envs, seed):
         pytest.param("async", 1, marks=pytest.mark.slow),
         pytest.param("multi_sync", 0, marks=pytest.mark.slow),
         pytest.param("multi_async", 2, marks=pytest.mark.slow),
-        pytest.param("ray", 0, marks=pytest.mark.slow),
     ],
 )
 def test_episodes_that_begin_in_a_batch_are_drawn_from_its_ranges(kind, late):
-    if kind == "ray":
-        pytest.importorskip("ray")
+    assert_ranges_are_followed(kind, late)
+
+
+def assert_ranges_are_followed(kind, late):
+    """Those of Ray are looked at where a cluster is, in test_ray.py."""
     env = robots(8 if kind == "single" else 1, 0)
     source = make_collector(parts.config(kind), env, robots, parts.actor(), 128 * 6, 0, 0, parts.CPU)
     try:

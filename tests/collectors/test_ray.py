@@ -11,6 +11,7 @@ import torch
 
 from physai.errors import UserError
 from tests.collectors import parts
+from tests.collectors.test_ranges import assert_ranges_are_followed
 from tests.training.processes import all_gone, command_of, descendants
 from tests.training.small import TINY, command
 
@@ -60,6 +61,11 @@ def test_frames_are_those_of_processes_without_ray_and_go_on_bit_for_bit(cluster
         next(batches)
     again.shutdown()
     assert all_gone(workers)
+
+
+def test_ranges_that_a_learner_moves_reach_robots_of_ray(cluster, monkeypatch):
+    monkeypatch.setitem(parts.KINDS["ray"], "ray_init", parts.RAY | {"address": cluster[0]})
+    assert_ranges_are_followed("ray", 0)
 
 
 @pytest.fixture(scope="module")

@@ -12,11 +12,11 @@ from tests.ros.loop import FAR, Arm
 from tests.ros.peer import Peer, free_domain, node_command
 
 
-def reach_goal_after_goal(start, peer, policy_path):
-    start.run(node_command("virtual_robot"))
-    parameters = {"policy_path": policy_path, "autostart": True, "max_velocity": 1.0, "limit_margin": 0.2}
-    start.run(node_command("inference_node", **parameters))
-    for x, y in [(0.1, 0.4), (-0.3, -0.2), (0.4, 0.0)]:
+PARAMETERS = {"autostart": True, "max_velocity": 1.0, "limit_margin": 0.2}
+
+
+def reach_goals(peer, *goals):
+    for x, y in goals:
         peer.wait_state("waiting", "reached")
         peer.send_goal(x, y)
         since, _ = peer.wait_state("active")
@@ -27,7 +27,10 @@ def reach_goal_after_goal(start, peer, policy_path):
 @pytest.mark.realtime
 @pytest.mark.slow
 def test_the_arm_reaches_goal_after_goal(start, peer, policy_path):
-    reach_goal_after_goal(start, peer, policy_path)
+    """The nodes are started as a user starts them."""
+    start.run(node_command("virtual_robot"))
+    start.run(node_command("inference_node", policy_path=policy_path, **PARAMETERS))
+    reach_goals(peer, (0.1, 0.4), (-0.3, -0.2), (0.4, 0.0))
 
 
 @pytest.mark.slow
@@ -59,4 +62,6 @@ def test_each_joint_is_commanded_at_its_place_and_one_that_is_not_the_policy_s_s
 @pytest.mark.realtime
 @pytest.mark.slow
 def test_with_a_policy_that_remembers_it_does_too(start, peer, recurrent_run):
-    reach_goal_after_goal(start, peer, recurrent_run / "policy.pt")
+    start("virtual_robot")
+    start("inference_node", policy_path=recurrent_run / "policy.pt", **PARAMETERS)
+    reach_goals(peer, (0.1, 0.4), (-0.3, -0.2))

@@ -11,7 +11,7 @@ from tests.waiting import wait_for
 from tests.web.conftest import browser  # noqa: F401  # a fixture
 from tests.web.test_play import GREEN, REACH, Camera, colored, drag_along_y, picture
 
-SIZE = {"width": 1000, "height": 640}
+SIZE = {"width": 700, "height": 450}
 SEEN_FROM = ((0.0, -0.9 * REACH, 1.1 * REACH), (0.0, 0.0, 0.0))  # of one robot
 
 

@@ -116,7 +116,7 @@ def test_one_message_stops_every_robot_at_once(start, peer, policy_path):
     everyone = peer.publisher(Bool, "/emergency_stop")
     wait_for(lambda: everyone.get_subscription_count() >= 2 * len(robots))
     late = []
-    for trial in range(5):
+    for trial in range(3):
         if trial:
             for robot in robots:
                 robot.reset()
@@ -217,7 +217,7 @@ def fleet(*overrides: str) -> list[str]:
 @pytest.mark.slow
 @pytest.mark.realtime
 def test_the_demo_drives_a_fleet_and_leaves_nothing_behind(start, policy_path):
-    process = start.run(fleet(f"policies=[{policy_path}]", "arms=2", "seconds=20", "randomization=none"))
+    process = start.run(fleet(f"policies=[{policy_path}]", "arms=2", "seconds=12", "randomization=none"))
     assert process.wait(120) == 0, process.output
     told = [line for line in process.lines if "goals reached" in line]
     assert len(told) == 2

@@ -13,6 +13,7 @@ import sys
 import sysconfig
 import venv as venv_module
 import zipfile
+from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from xml.etree import ElementTree
@@ -80,23 +81,28 @@ def test_the_config_file_is_what_the_nodes_have():
 
 
 @pytest.fixture(scope="session")
-def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def wheel(once: Callable[[str, Callable[[Path], None]], Path]) -> Path:
     """The wheel of this working tree."""
-    folder = tmp_path_factory.mktemp("wheel")
-    return Path(next(iter(WheelBuilder(str(REPOSITORY)).build(directory=str(folder), versions=["standard"]))))
+
+    def build(folder: Path) -> None:
+        list(WheelBuilder(str(REPOSITORY)).build(directory=str(folder), versions=["standard"]))
+
+    return next(once("wheel", build).glob("*.whl"))
 
 
 @pytest.fixture(scope="session")
-def venv(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def venv(wheel: Path, once: Callable[[str, Callable[[Path], None]], Path]) -> Path:
     """A venv with the wheel, which borrows everything else from the venv of these tests."""
-    folder = tmp_path_factory.mktemp("venv")
-    venv_module.create(folder, symlinks=True)
-    [site] = folder.glob("lib/python*/site-packages")
-    borrowed = sysconfig.get_path("purelib")
-    (site / "borrowed.pth").write_text(f"import site; site.addsitedir({borrowed!r})\n")
-    install = ["install", "--quiet", "--no-deps", "--no-index", "--ignore-installed", str(wheel)]
-    subprocess.run([sys.executable, "-m", "pip", "--python", str(folder), *install], check=True)
-    return folder
+
+    def build(folder: Path) -> None:
+        venv_module.create(folder, symlinks=True)
+        [site] = folder.glob("lib/python*/site-packages")
+        borrowed = sysconfig.get_path("purelib")
+        (site / "borrowed.pth").write_text(f"import site; site.addsitedir({borrowed!r})\n")
+        install = ["install", "--quiet", "--no-deps", "--no-index", "--ignore-installed", str(wheel)]
+        subprocess.run([sys.executable, "-m", "pip", "--python", str(folder), *install], check=True)
+
+    return once("venv", build)
 
 
 def environment(prefix: Path) -> dict[str, str]:

@@ -55,8 +55,11 @@ def small_config(*overrides: str) -> TrainConfig:
     return validate(TrainConfig, composed(*SMALL, *overrides))
 
 
-# What every command imports, which takes longer than most of them run.
-IMPORTED = ("physai.training.run", "physai.cli", "physai.algorithms", "physai.collectors", "physai.physics.pybullet")
+# What every command imports, sooner or later, which takes longer than most of them run.
+IMPORTED = (
+    *("physai.training.run", "physai.cli", "physai.algorithms", "physai.collectors", "physai.physics.pybullet"),
+    *("physai.plots.curriculum", "physai.plots.runs", "scipy.stats", "torch.utils.tensorboard"),
+)
 
 
 def command(module: str, *arguments: str, cwd: Path) -> Forked:
