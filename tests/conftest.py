@@ -205,7 +205,13 @@ def panda_run(once: Callable[[str, Callable[[Path], None]], Path]) -> Path:
 @pytest.fixture(scope="session")
 def walking_run(once: Callable[[str, Callable[[Path], None]], Path]) -> Path:
     """A run of a robot on legs, without policy.onnx; short, for it walks from the first frame on."""
-    overrides = ("env=a1_walk", "physics=mujoco", "total_frames=12_288", "env.task.max_steps=100", "evaluation.goals=20")
+    overrides = (
+        "env=a1_walk",
+        "physics=mujoco",
+        "total_frames=12_288",
+        "env.task.max_steps=100",
+        "evaluation.goals=20",
+    )
     return once("walking_run", partial(_train_and_export, *overrides, formats=["torchscript"]))
 
 

@@ -11,7 +11,6 @@ from tests.ros.forge import forged
 from tests.ros.loop import FAR, Arm
 from tests.ros.peer import Peer, free_domain, node_command
 
-
 PARAMETERS = {"autostart": True, "max_velocity": 1.0, "limit_margin": 0.2}
 
 

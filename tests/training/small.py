@@ -19,9 +19,9 @@ from tests.composed import composed
 from tests.forge import Forked, forge_of
 
 SMALL = (
-    "total_frames=16384",
+    "total_frames=8192",
     "checkpoint.every_frames=2048",
-    "evaluation.every_frames=8192",
+    "evaluation.every_frames=4096",
     "evaluation.goals=16",
     "evaluation.episodes=32",
     "evaluation.in_a_row=2",

@@ -79,7 +79,7 @@ def test_it_goes_on_bit_for_bit_after_the_other_run_is_gone(exported_run, tmp_pa
     run_here(tmp_path / "whole", *SMALL, f"pretrained={tmp_path / 'other'}")
     shutil.rmtree(tmp_path / "other")
     shutil.copytree(tmp_path / "whole", tmp_path / "run")
-    forget_after(tmp_path / "run", 14336)
+    forget_after(tmp_path / "run", 6144)
     resume_here(tmp_path / "run")
     assert_same_run(tmp_path / "run", tmp_path / "whole")
 
