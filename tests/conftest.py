@@ -185,7 +185,7 @@ def position_run(once: Callable[[str, Callable[[Path], None]], Path]) -> Path:
 
 @pytest.fixture(scope="session")
 def recurrent_run(once: Callable[[str, Callable[[Path], None]], Path]) -> Path:
-    """The same, of a policy that remembers."""
+    """A run as ``exported_run`` is, of a policy that remembers."""
     return once("recurrent_run", partial(_train_and_export, "policy=gru", "total_frames=80_000"))
 
 

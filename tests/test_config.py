@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 from omegaconf import OmegaConf
+from torchrl.envs import TransformedEnv
 
 import physai.compose
 from physai.compose import compose, conf_dir
@@ -78,8 +79,9 @@ def test_every_choice_builds_and_collects(override, request):
     group, name = override.split("=")
     beside = [BESIDE[group](name)] if group in BESIDE else []
     agent = Agent.build(small(*beside, override, teacher=partial(request.getfixturevalue, "teacher_run")))
-    batch = next(iter(agent.collector))
+    batch, zeros = next(iter(agent.collector)), TransformedEnv.fake_tensordict(agent.env)
     assert batch.shape == (4, 16)
+    assert set(agent.env.fake_tensordict().keys(True, True)) == set(zeros.keys(True, True))  # for collecting processes
     agent.algorithm.update(batch)
     agent.close()
 

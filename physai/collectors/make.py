@@ -81,7 +81,7 @@ def make_collector(
         cpu = torch.device("cpu")
         # Named devices are cast to at every step; where all is on the CPU, nothing needs to be.
         devices = {} if device == cpu else {"policy_device": device, "env_device": cpu, "storing_device": cpu}
-        # New batches are as fast as one that is filled again; to make that one, TensorDict would import pandas.
+        # New batches are as fast as one that is filled again.
         return RobotCollector(env, policy, auto_register_policy_transforms=False, use_buffers=False, **sizes, **devices)
 
     def make_worker_env(worker: int) -> TransformedRobotEnv:

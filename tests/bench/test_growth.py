@@ -10,15 +10,24 @@ from physai.bench import growth
 
 @pytest.mark.slow
 def test_runs_are_measured_drawn_and_shown(monkeypatch, tmp_path):
-    monkeypatch.setattr(growth, "FRAMES", ())
+    """One run is trained; of the others what it took is said again."""
+    train_apart, trained = growth.train_apart, []
+
+    def train(env, frames, robots, seed):
+        if not trained:
+            trained.append(train_apart(env, frames, robots, seed))
+        return replace(trained[0], frames=frames, robots=robots)
+
+    monkeypatch.setattr(growth, "train_apart", train)
+    monkeypatch.setattr(growth, "FRAMES", (2048, 6144))
     monkeypatch.setattr(growth, "ROBOTS", (64,))
-    monkeypatch.setattr(growth, "ROBOTS_FRAMES", 2048)
-    by_frames, (run,) = growth.measure_growth(seed=0)
-    assert by_frames == []
-    assert (run.frames, run.robots) == (2048, 64)
+    monkeypatch.setattr(growth, "ROBOTS_FRAMES", 4096)
+    by_frames, by_robots = growth.measure_growth(seed=0)
+    assert [(run.frames, run.robots) for run in by_frames + by_robots] == [(2048, 512), (6144, 512), (4096, 64)]
+    (run,) = trained
+    assert (run.frames, run.robots) == (2048, 512)
     assert run.seconds > 0
     assert 100 < run.megabytes < 10_000
-    by_frames, by_robots = [run, replace(run, frames=6144, seconds=2 * run.seconds)], [run]
     growth.growth_figure(by_frames, by_robots, tmp_path / "new" / "growth.png")
     assert (tmp_path / "new" / "growth.png").stat().st_size > 10_000
     console = Console(width=120, record=True)

@@ -8,7 +8,7 @@ from physai.bench import identify
 
 @pytest.mark.slow
 def test_hidden_robots_are_found_and_shown(monkeypatch):
-    cases = ("MuJoCo in MuJoCo", "drives as PyBullet's motors")
+    cases = ("PyBullet in MuJoCo", "drives as PyBullet's motors")
     monkeypatch.setattr(identify, "CASES", {case: identify.CASES[case] for case in cases})
     found = identify.measure_identify(seed=1, robots=1, seconds=6.0)
     assert {case: len(each) for case, each in found.items()} == dict.fromkeys(cases, 1)

@@ -1,6 +1,8 @@
 """Other libraries are told of our robots what they expect, and all learners race, are timed and shown."""
 
 import multiprocessing
+import os
+import sys
 import time
 from dataclasses import replace
 from functools import partial
@@ -141,9 +143,13 @@ def test_rsl_rl_learns_batch_by_batch(settings):
     learner.close()
 
 
-def test_the_threads_that_learn_fastest_are_chosen(capsys):
-    assert fastest_threads("rsl_rl", replace(rsl_rl.TUNED, robots=4)) in THREADS
-    assert "by torch threads" in capsys.readouterr().out
+def test_the_threads_that_learn_fastest_are_chosen(capsys, monkeypatch):
+    def speeds(*trials, rounds):
+        return [trial() * float(number) for number, trial in enumerate(trials, 1)]  # each learns a batch of one size
+
+    monkeypatch.setattr("physai.bench.learner.median_speeds", speeds)
+    assert fastest_threads("rsl_rl", replace(rsl_rl.TUNED, robots=4)) == THREADS[-1]
+    assert f"it gets {THREADS[-1]}" in capsys.readouterr().out
 
 
 def assert_learns(learner, frames):
@@ -238,7 +244,7 @@ def test_who_does_not_arrive_is_ahead_of_nobody():
 
 @pytest.mark.slow
 def test_learners_race_in_processes_of_their_own(monkeypatch, capfd):
-    """After JAX, whose threads no fork survives, physai still forks; and who is not here is left out by name."""
+    """JAX, whose threads no fork survives, is in none but its own; and who is not here is left out by name."""
     apart, chosen = training.apart, training._fastest_threads  # which learns, and JAX compiles for seconds
     monkeypatch.setattr(training, "apart", lambda what, *given: 1 if what is chosen else apart(what, *given))
     peers = {name: training.PEERS[name] for name in ("SBX, tuned, physai's features",)}
@@ -252,6 +258,8 @@ def test_learners_race_in_processes_of_their_own(monkeypatch, capfd):
         assert one.seconds > 0
         assert name in shown(sides)
     assert "Nobody: no_such_package is not here; left out" in capfd.readouterr().out
+    assert "jax" not in sys.modules
+    assert apart(os.getpid) != os.getpid()
 
 
 @pytest.mark.parametrize("name", [name for name, peer in training.PEERS.items() if peer[0] != "sbx"])

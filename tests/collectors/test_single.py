@@ -8,8 +8,8 @@ from physai.transforms import RunningStatistics
 from tests.collectors import parts
 
 
-def collector(frames=256, total=1024, seed=0, robots=16):
-    config, env = parts.config("single", robots, frames), parts.robots(robots, seed)
+def collector(frames=256, total=1024, seed=0):
+    config, env = parts.config("single", 16, frames), parts.robots(16, seed)
     return make_collector(config, env, parts.robots, parts.actor(), total, seed, 0, parts.CPU)
 
 
@@ -52,7 +52,7 @@ def resident_megabytes():
 @pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="needs /proc")
 def test_memory_stays_flat_while_frames_go_by():
-    source = collector(frames=1600, total=160_000, robots=100)
+    source = collector(frames=1600, total=160_000)
     sizes = []
     for batch in source:
         RunningStatistics(source.env.normalizer, 0.01).update(batch["observation"])

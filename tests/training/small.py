@@ -32,7 +32,7 @@ SMALL = (
 )
 
 # Runs of which several processes step a share of the robots each.
-SIZES = (*SMALL, "collector.num_envs=64", "collector.frames_per_batch=1024", "env.task.max_steps=40")
+SIZES = (*SMALL, "total_frames=16384", "collector.num_envs=64", "env.task.max_steps=40")
 
 # Runs of two iterations, episodes of 20 steps: for tests of what starts them.
 TINY = (
@@ -55,7 +55,7 @@ def small_config(*overrides: str) -> TrainConfig:
     return validate(TrainConfig, composed(*SMALL, *overrides))
 
 
-# What every command imports, sooner or later, which takes longer than most of them run.
+# What training imports, sooner or later, which takes longer than most commands run.
 IMPORTED = (
     *("physai.training.run", "physai.cli", "physai.algorithms", "physai.collectors", "physai.physics.pybullet"),
     *("physai.plots.curriculum", "physai.plots.runs", "scipy.stats", "torch.utils.tensorboard"),

@@ -109,7 +109,7 @@ def test_ranges_grow_linearly_from_the_robot_as_described_to_the_whole_randomiza
 @pytest.fixture(scope="module", params=["single", "multi_sync", "multi_async"])
 def finished(request, tmp_path_factory):
     run = tmp_path_factory.mktemp("curriculum") / "run"
-    run_here(run, *SMALL, *EAGER, "collector.num_envs=64", "total_frames=8192", f"collector={request.param}")
+    run_here(run, *SMALL, *EAGER, "collector.num_envs=64", f"collector={request.param}")
     return run
 
 

@@ -13,7 +13,7 @@ from physai.training.agent import Agent
 from physai.training.run import load_config
 from tests.training.small import SMALL, assert_same_run, forget_after, resume_here, run_here, small_config, train_here
 
-STUDENT = (*SMALL, "algo=distill", "randomization=strong", "collector.num_envs=64", "total_frames=8192")
+STUDENT = (*SMALL, "algo=distill", "randomization=strong", "collector.num_envs=64")
 
 
 def of(teacher, *overrides):

@@ -11,7 +11,6 @@ from tests.training.small import SMALL, assert_same_run, forget_after, resume_he
 OFF_POLICY = (
     "algo=sac",
     *SMALL,
-    "total_frames=8192",
     "checkpoint.every_frames=1024",
     "checkpoint.keep=10",
     "algo.warmup_frames=2048",

@@ -16,7 +16,7 @@ from tests.training.small import (
     train_here,
 )
 
-RECURRENT = ("policy=gru", *SMALL, "collector.num_envs=64", "total_frames=8192")  # sequences of 16 steps
+RECURRENT = ("policy=gru", *SMALL, "collector.num_envs=64")  # sequences of 16 steps
 
 
 def test_collected_sequences_have_the_probabilities_that_learning_starts_from():

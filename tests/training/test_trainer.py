@@ -93,7 +93,8 @@ def test_a_run_killed_at_any_moment_and_resumed_ends_like_the_uninterrupted_one(
     if collector == "single":
         whole = once("small_run_single", lambda path: run_here(path / "run", *SMALL, "collector=single")) / "run"
     checkpoints = tmp_path / "run" / "checkpoints"
-    process = command("train", *SMALL, f"collector={collector}", "hydra.run.dir=run", cwd=tmp_path)
+    often = "checkpoint.every_frames=1024"
+    process = command("train", *SMALL, often, f"collector={collector}", "hydra.run.dir=run", cwd=tmp_path)
     if moment == "writing":
         wait_while_runs(process, lambda: len(list(checkpoints.glob("0*.pt"))) >= 2)
         while not any(checkpoints.glob(".*.tmp")) and process.poll() is None:
