@@ -143,6 +143,7 @@ def test_rsl_rl_learns_batch_by_batch(settings):
     learner.close()
 
 
+@pytest.mark.slow
 def test_the_threads_that_learn_fastest_are_chosen(capsys, monkeypatch):
     def speeds(*trials, rounds):
         return [trial() * float(number) for number, trial in enumerate(trials, 1)]  # each learns a batch of one size

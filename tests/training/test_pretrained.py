@@ -55,6 +55,7 @@ def test_robots_act_by_it_from_the_first_frame_on_in_the_collectors_processes_to
         torch.testing.assert_close(probability, batch["action_log_prob"])
 
 
+@pytest.mark.slow
 def test_what_it_began_with_stays_the_best_if_learning_only_harms_it(exported_run, tmp_path):
     run_here(tmp_path / "run", *TINY, f"pretrained={exported_run}", "algo.optimizer.lr=1.0", "env.task.max_steps=150")
     kept, trained = best_of(tmp_path / "run"), best_of(exported_run)
@@ -62,6 +63,7 @@ def test_what_it_began_with_stays_the_best_if_learning_only_harms_it(exported_ru
     assert kept["frames"] == json.loads((tmp_path / "run" / "summary.json").read_text())["best_frames"] == 0
 
 
+@pytest.mark.slow
 def test_a_run_that_was_killed_before_its_first_checkpoint_begins_with_it_again(exported_run, tmp_path):
     run_here(tmp_path / "run", *TINY, f"pretrained={exported_run}", "env.task.max_steps=150")
     whole = tmp_path / "whole"
