@@ -13,7 +13,8 @@ from physai.bench.hidden import NOISE, Hidden, record
 from physai.bench.timing import config_of, table
 from physai.compose import cores
 from physai.envs.simulation import EnvConfig
-from physai.identify.fit import Fit, Predictor, fit
+from physai.identify.fit import Fit, fit
+from physai.identify.predictor import Predictor
 from physai.identify.trials import cut
 from physai.identify.unknowns import Unknowns
 from physai.physics import ParameterLayout

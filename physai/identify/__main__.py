@@ -18,7 +18,8 @@ from physai.config import Config, Count, Seed, validate
 from physai.envs.simulation import EnvConfig
 from physai.errors import UserError
 from physai.files import write_atomically
-from physai.identify.fit import SPREAD, Fit, Predictor, fit
+from physai.identify.fit import SPREAD, Fit, fit
+from physai.identify.predictor import Predictor
 from physai.identify.randomization import identified, text
 from physai.identify.recording import read
 from physai.identify.report import show, summary

@@ -1,7 +1,6 @@
 """Find the robot whose motions are those that were recorded."""
 
 import logging
-import math
 from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -11,11 +10,9 @@ from typing import Any
 import numpy as np
 from scipy.optimize import OptimizeResult, least_squares
 
+from physai.identify.predictor import Predictor
 from physai.identify.trials import Trials
 from physai.identify.unknowns import Unknowns
-from physai.physics import ParameterLayout, Physics, RobotState
-from physai.robots import RobotSpec
-from physai.targets import make
 
 _STEP = 1e-3  # units, over which slopes are taken
 _FIRST, _MORE, _LAST = 6, 15, 40  # evaluations from each start, from the best, and from the last ones
@@ -25,6 +22,7 @@ _DOUBT = 3.0  # times the errors of most motions, beyond which an error counts b
 _SPOILT = 3.0  # times the errors of most motions: one with more is left out,
 _MOST_SPOILT = 0.34  # of the motions; if there were more, it is the model
 _ROUNDS = 3
+_ENOUGH = 1e-6  # of its size, by which the cost must yet fall: of a fit by thousands of positions, that tells nothing
 _PART = 0.25  # of a step of the recording: how finely a delay is found
 _OFF = 3.0  # standard deviations by which it may have begun elsewhere than measured
 SHARE = 0.1  # of the largest in a direction, from which a parameter has a part in it
@@ -90,59 +88,6 @@ class Fit:
         """95 % intervals of the values, [2, F]."""
         ends = self.coordinates + SPREAD * np.array([[-1.0], [1.0]]) * self.deviation
         return self.unknowns.values(np.clip(ends, self.unknowns.low, self.unknowns.high))
-
-
-class Predictor:
-    """Lets robots with other parameters do what a real one did.
-
-    Args:
-        spec: The robot.
-        physics: The engine, as ``conf/physics`` names one.
-        control_dt: Of its env, s; the engine steps at the period of the recording.
-        trials: What it did, B motions.
-    """
-
-    def __init__(self, spec: RobotSpec, physics: dict[str, Any], control_dt: float, trials: Trials) -> None:
-        self._spec, self._config, self._trials = spec, physics, trials
-        self.per_control_step = control_dt / trials.period
-        self._layout = ParameterLayout(spec)
-        self.effort_limit = self._layout.columns["effort_limit"]
-        self._made: dict[int, Physics] = {}
-
-    def __call__(self, parameters: np.ndarray, delay: float, start: np.ndarray) -> np.ndarray:
-        """Map ``physics_parameters`` [R, P] to what sensors would have said, [R, 3, T, B, n].
-
-        Args:
-            parameters: Of R robots, each of which makes all the motions.
-            delay: Of their actuators, steps of the recording; of a fraction, a step feels the mean of two commands.
-            start: What the encoders say when the motions begin, rad, [R, B, n].
-        """
-        trials, rows = self._trials, len(parameters)
-        robots, joints = rows * len(trials), trials.start.shape[1]
-        if robots not in self._made:
-            needs = ("reset", "step", "close")
-            made: Physics = make("physics", self._config, self._spec, robots, trials.period, needs=needs)
-            self._made[robots] = made
-        physics = self._made[robots]
-        each = np.repeat(parameters, len(trials), axis=0)
-        offset = each[:, self._layout.columns["encoder_offset"]]
-        true = start.reshape(robots, joints) - offset
-        state = RobotState(true, np.tile(trials.velocity, (rows, 1)))
-        physics.reset(np.arange(robots), state, self._layout.dynamics(each, self.per_control_step))
-        given = np.concatenate([np.repeat(trials.before[None], math.ceil(delay), axis=0), trials.command])
-        late = math.ceil(delay) - delay  # of a step, in which the newer of two commands is in force
-        arrives = given if late == 0.0 else (1.0 - late) * given[:-1] + late * given[1:]
-        seen = np.empty((len(trials.command), 3, robots, joints))
-        for step, now in enumerate(seen):
-            state = physics.step(np.tile(arrives[step], (rows, 1)))
-            now[0], now[1] = state.joint_position + offset, state.joint_velocity
-            now[2] = 0.0 if state.joint_effort is None else state.joint_effort
-        return seen.reshape(len(seen), 3, rows, len(trials), joints).transpose(2, 1, 0, 3, 4)
-
-    def close(self) -> None:
-        """Free the engines."""
-        for physics in self._made.values():
-            physics.close()
 
 
 @contextmanager
@@ -251,6 +196,7 @@ class _Problem:
         self._held_out = measured[:2] & trials.held_out[:, None]
         self._noise = trials.noise[:, None, None, :]
         self._kept = np.ones(len(trials), dtype=bool)
+        self._learned = np.flatnonzero(~trials.held_out)
         self._doubt = _DOUBT
         anywhere = np.full(trials.start.size, np.inf)
         self.low = np.concatenate([unknowns.low, -anywhere])
@@ -273,17 +219,18 @@ class _Problem:
         margin = 1e-6
         return np.clip(coordinates, self.low + margin, self.high - margin)
 
-    def _all(self, coordinates: np.ndarray, delay: float) -> np.ndarray:
-        """Errors in units of the noise, [R, 3, T, B, n]."""
+    def _all(self, coordinates: np.ndarray, delay: float, motions: np.ndarray | None = None) -> np.ndarray:
+        """Errors in units of the noise, [R, 3, T, B, n], of all motions or of those with these numbers."""
         size, trials = len(self._unknowns), self._trials
+        motions = np.arange(len(trials)) if motions is None else motions
         start = trials.start + trials.start_noise * coordinates[:, size:].reshape(-1, *trials.start.shape)
-        seen = self._predict(self._unknowns.parameters(coordinates[:, :size]), delay, start)
-        return (seen - trials.measured) / self._noise
+        seen = self._predict(self._unknowns.parameters(coordinates[:, :size]), delay, start[:, motions], motions)
+        return (seen - trials.measured[:, :, motions]) / self._noise
 
     def errors(self, coordinates: np.ndarray, delay: float) -> np.ndarray:
         """Errors of the motions that are fitted; then how far all is from what was believed, which counts as little."""
-        errors = self._all(coordinates[None], delay)[0]
-        return np.concatenate([errors[self._fitted], coordinates])
+        errors = self._all(coordinates[None], delay, self._learned)[0]
+        return np.concatenate([errors[self._fitted[:, :, self._learned]], coordinates])
 
     def slopes(self, coordinates: np.ndarray, delay: float) -> np.ndarray:
         """Of these errors, [errors, F + B n].
@@ -295,14 +242,14 @@ class _Problem:
         changes = np.zeros((1 + size + joints, len(coordinates)))
         changes[1 : 1 + size, :size] = np.diag(step)
         changes[1 + size :, size:] = np.tile(np.eye(joints), trials)
-        errors = self._all(coordinates + changes, delay)
-        slopes = np.zeros((int(self._fitted.sum()), len(coordinates)))
-        slopes[:, :size] = (errors[1 : 1 + size] - errors[0])[:, self._fitted].T / step
+        errors, fitted = self._all(coordinates + changes, delay, self._learned), self._fitted[:, :, self._learned]
+        slopes = np.zeros((int(fitted.sum()), len(coordinates)))
+        slopes[:, :size] = (errors[1 : 1 + size] - errors[0])[:, fitted].T / step
         for joint, change in enumerate(errors[1 + size :] - errors[0]):
-            for trial in range(trials):
+            for number, trial in enumerate(self._learned):
                 own = np.zeros_like(change)
-                own[:, :, trial] = change[:, :, trial]
-                slopes[:, size + trial * joints + joint] = own[self._fitted]
+                own[:, :, number] = change[:, :, number]
+                slopes[:, size + trial * joints + joint] = own[fitted]
         return np.concatenate([slopes, np.eye(len(coordinates))])
 
     def _of_motions(self, result: OptimizeResult, delay: float) -> np.ndarray:
@@ -328,11 +275,14 @@ class _Problem:
         if (kept == self._kept).all() or not few:
             return False
         self._kept, self._fitted, self._held_out = kept, fitted, held_out
+        self._learned = np.flatnonzero(kept & ~self._trials.held_out)
         return True
 
     def solve(self, start: np.ndarray, delay: float, evaluations: int) -> tuple[OptimizeResult, float]:
         """Go downhill from somewhere, with a given delay."""
+        # Scipy's dogbox needs half as many evaluations, but of one robot in twenty it finds another one.
         options: dict[str, Any] = {"bounds": (self.low, self.high), "x_scale": "jac", "max_nfev": evaluations}
+        options |= {"ftol": _ENOUGH, "xtol": None, "gtol": None}
         if np.isfinite(self._doubt):
             options |= {"loss": "huber", "f_scale": self._doubt}
         return least_squares(self.errors, self.inside(start), self.slopes, args=(delay,), **options), delay

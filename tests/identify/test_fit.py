@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from physai.bench.hidden import NOISE, record
-from physai.identify.fit import Predictor, _downhill, fit
+from physai.identify.fit import _downhill, fit
+from physai.identify.predictor import Predictor
 from physai.identify.trials import cut
 from physai.identify.unknowns import Unknowns
 from physai.physics import ParameterLayout
@@ -102,10 +103,10 @@ def test_a_motion_is_predicted_from_the_speed_at_which_it_begins(env_config, str
     trials = cut(hidden.recording, "robot", hidden.spec)
     standing = dataclasses.replace(trials, command=np.zeros_like(trials.command))
     moving = dataclasses.replace(standing, velocity=standing.velocity + 0.3)
-    velocities = []
+    velocities, motions = [], np.arange(len(trials))
     for each in (standing, moving):
         with closing(Predictor(hidden.spec, config.physics, hidden.recording.period, each)) as predict:
-            velocities.append(predict(hidden.parameters[None], 0.0, each.start[None])[0, 1])
+            velocities.append(predict(hidden.parameters[None], 0.0, each.start[None], motions)[0, 1])
     assert np.abs(velocities[0]).max() < 1e-3
     assert (velocities[1][0] > 0.03).all()  # a drive with a time constant of 15 ms has nearly stopped it in 20 ms
     assert np.abs(velocities[1][10]).max() < 0.01
