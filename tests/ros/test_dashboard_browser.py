@@ -8,10 +8,10 @@ import pytest
 from tests.ros.loop import Arm
 from tests.ros.test_dashboard import dashboard
 from tests.waiting import wait_for
-from tests.web.conftest import browser  # noqa: F401  # a fixture
+from tests.web.conftest import new_page  # noqa: F401  # a fixture
 from tests.web.test_play import GREEN, REACH, Camera, colored, drag_along_y, picture
 
-SIZE = {"width": 700, "height": 450}
+SIZE = 700, 450
 SEEN_FROM = ((0.0, -0.9 * REACH, 1.1 * REACH), (0.0, 0.0, 0.0))  # of one robot
 
 
@@ -23,11 +23,11 @@ def arm(peer):
 
 
 @pytest.fixture
-def page(start, arm, peer, policy_path, browser):  # noqa: F811
+def page(start, arm, peer, policy_path, new_page):  # noqa: F811
     start("inference_node", policy_path=policy_path, autostart=True)
     peer.wait_state("waiting", timeout=60.0)
     _, address = dashboard(start)
-    page = browser.new_page(viewport=SIZE)
+    page = new_page(*SIZE)
     page.goto(address)
     page.get_by_text("This page is a convenience").wait_for()
     yield page

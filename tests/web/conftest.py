@@ -4,10 +4,10 @@ import contextlib
 import re
 import shutil
 import signal
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import pytest
-from playwright.sync_api import Browser, sync_playwright
+from playwright.sync_api import Page, sync_playwright
 
 from tests.training.small import command
 
@@ -19,15 +19,28 @@ FLAGS = [
     *("--disable-component-update", "--disable-sync"),
 ]
 
+# At most five pictures a second: as many as a processor can draw would take the time of what they are pictures of.
+FEW_PICTURES = """
+window.requestAnimationFrame = (draw) => setTimeout(() => draw(performance.now()), 200);
+window.cancelAnimationFrame = clearTimeout;
+"""
+
 
 @pytest.fixture(scope="module")
-def browser() -> Iterator[Browser]:
+def new_page() -> Iterator[Callable[[int, int], Page]]:
+    """Open an empty page of a width and a height, in pixels: ``new_page(800, 520)``."""
     path = shutil.which("chromium")
     assert path, "these tests need Chromium: apt-get install chromium"
     with sync_playwright() as playwright:
-        opened = playwright.chromium.launch(executable_path=path, args=FLAGS)
-        yield opened
-        opened.close()
+        browser = playwright.chromium.launch(executable_path=path, args=FLAGS)
+
+        def new_page(width: int, height: int) -> Page:
+            page = browser.new_page(viewport={"width": width, "height": height})
+            page.add_init_script(FEW_PICTURES)
+            return page
+
+        yield new_page
+        browser.close()
 
 
 @pytest.fixture

@@ -13,7 +13,7 @@ from physai.web.server import camera
 from tests.waiting import wait_for
 
 REACH = 0.55  # m, of the arm
-SIZE = {"width": 800, "height": 520}
+SIZE = 800, 520
 GREEN, ORANGE = (30, 180, 80), (242, 115, 31)  # the goal, the upper arm
 
 
@@ -92,10 +92,10 @@ def drag_along_y(page, seen, start, end):
 
 
 @pytest.fixture
-def page(browser, serving, exported_run, tmp_path):
+def page(new_page, serving, exported_run, tmp_path):
     shutil.copy(exported_run / "policy.pt", tmp_path)
     with serving("play", "run=policy.pt", "randomization=none", "seed=8") as address:
-        page = browser.new_page(viewport=SIZE)
+        page = new_page(*SIZE)
         page.goto(address)
         page.get_by_text("Goals by themselves").wait_for()
         yield page
@@ -159,10 +159,10 @@ def test_an_arm_follows_the_goal_that_the_mouse_drags_and_stands_still_when_paus
 
 
 @pytest.fixture
-def walk_page(browser, serving, walking_run, tmp_path):
+def walk_page(new_page, serving, walking_run, tmp_path):
     shutil.copy(walking_run / "policy.pt", tmp_path)
     with serving("play", "run=policy.pt", "randomization=none") as address:
-        page = browser.new_page(viewport=SIZE)
+        page = new_page(*SIZE)
         page.goto(address)
         page.get_by_text("Asked for").wait_for()
         yield page

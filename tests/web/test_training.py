@@ -36,10 +36,10 @@ def test_watching_changes_no_result_and_shows_the_first_robots():
 
 
 @pytest.mark.slow
-def test_episodes_that_are_handed_over_move_the_arms_on_the_page_until_training_ends(browser, reacher):
+def test_episodes_that_are_handed_over_move_the_arms_on_the_page_until_training_ends(new_page, reacher):
     """Ten seconds for a page in a process of its own."""
     shown = TrainingPage(reacher, "127.0.0.1", 0)
-    page = browser.new_page(viewport={"width": 800, "height": 520})
+    page = new_page(800, 520)
     page.goto(shown.address)
     page.get_by_text("The first evaluation is still to come.").wait_for()
     wait_for(lambda: (picture(page) == picture(page)).all(), 60.0, "a picture that stands still")
