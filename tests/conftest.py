@@ -1,5 +1,6 @@
 """What tests share: one thread, the environments that physai comes with, and runs that are made once."""
 
+import gc
 import os
 import runpy
 import shutil
@@ -14,6 +15,8 @@ from typing import Any
 # Workers of pytest have a core each. Libraries read this when they are imported, also in processes that tests start.
 for library in ("OMP", "MKL", "OPENBLAS"):
     os.environ[f"{library}_NUM_THREADS"] = "1"
+
+gc.disable()  # until all is imported: what that makes stays, and looking for garbage in it takes a quarter longer
 
 import pytest
 import torch
@@ -61,6 +64,11 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     wanted = [item for item in items if (item.get_closest_marker("realtime") is not None) == (chosen == "only")]
     config.hook.pytest_deselected(items=[item for item in items if item not in wanted])
     items[:] = wanted
+
+
+def pytest_collection_finish() -> None:
+    gc.freeze()
+    gc.enable()
 
 
 @pytest.fixture

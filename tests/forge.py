@@ -6,6 +6,7 @@ and it ends with its input.
 
 import contextlib
 import ctypes
+import gc
 import importlib
 import json
 import os
@@ -194,8 +195,11 @@ def _import(modules: Sequence[str]) -> None:
     """PyBullet prints a line, of which neither the tests nor each process shall hear."""
     stdout = os.dup(1)
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+    gc.disable()
     for module in modules:
         importlib.import_module(module)
+    gc.freeze()  # no process looks for garbage in what is imported
+    gc.enable()
     ctypes.CDLL(None).fflush(None)
     os.dup2(stdout, 1)
     os.close(stdout)

@@ -111,4 +111,3 @@ def test_garbage_is_collected_again_after_the_check(error):
         if error is not None:
             raise error
     assert gc.isenabled()
-    gc.unfreeze()
