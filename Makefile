@@ -61,8 +61,8 @@ test: $(VENV)/.installed-dev chromium  ## Run all tests (ARGS="-m 'not slow'" fo
 	part() { echo "==> Testing $$1"; shift; $(BIN)/python -m pytest "$$@" $(ARGS) || [ $$? = 5 ]; }; \
 	if [ -n "$(findstring not slow,$(ARGS))" ]; then part "what is quick" -n 3 --dist worksteal --realtime=without; exit; fi; \
 	part "what is not ROS" -n 3 --dist worksteal --ignore tests/ros --realtime=without && \
-	part "ROS 2 nodes, which mostly wait, side by side" tests/ros -n 3 --dist worksteal --realtime=without && \
-	part "what measures time, three at a time and nothing else" tests/ros tests/bench -n 3 --dist worksteal --realtime=only
+	part "ROS 2 nodes, which mostly wait, side by side" tests/ros -n 4 --dist worksteal --realtime=without && \
+	part "what measures time, four at a time and nothing else" tests/ros tests/bench -n 4 --dist worksteal --realtime=only
 
 bench: $(VENV)/.installed-dev  ## Measure speed against bare PyBullet, rclpy and Stable-Baselines3
 	@echo "==> Measuring (all of it takes several hours; ARGS=--collection and the like choose a part)"

@@ -207,7 +207,8 @@ def teacher_run(once: Callable[[str, Callable[[Path], None]], Path]) -> Path:
 @pytest.fixture(scope="session")
 def panda_run(once: Callable[[str, Callable[[Path], None]], Path]) -> Path:
     """A run of a Panda whose goals are positions in space."""
-    return once("panda_run", partial(_train_and_export, "env=panda_reach", "physics=mujoco", "total_frames=320_000"))
+    overrides = ("env=panda_reach", "physics=mujoco", "total_frames=320_000", "evaluation.every_frames=160_000")
+    return once("panda_run", partial(_train_and_export, *overrides))
 
 
 @pytest.fixture(scope="session")

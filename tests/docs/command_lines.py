@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Callable, Sequence
+from functools import cache
 from importlib import import_module
 from typing import Any
 
@@ -28,6 +29,7 @@ from physai.search.config import SearchConfig
 from physai.signals import Quantity
 from physai.stress.__main__ import StressConfig
 from physai.training.config import TrainConfig
+from tests.composed import composed
 from tests.docs.blocks import ROOT, hooks
 
 PYPROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
@@ -93,12 +95,17 @@ def _check_hydra(name: str, model: Any, given: Sequence[str]) -> None:
     assert flags <= {"-m", "--help"}, flags
     overrides = [word for word in given if word not in flags and not word.startswith("resume=")]
     for job in jobs(overrides) if overrides else [[]]:
-        config = compose(name, job, hydra=True)
-        OmegaConf.to_container(config.hydra.launcher, resolve=False)
-        validated = validate(model, OmegaConf.masked_copy(config, [key for key in config if key != "hydra"]))
-        if isinstance(getattr(validated, "env", None), dict):
-            engine = validated.env["physics"] or compose("train", []).physics  # None stands for that of the run
-            validate(EnvConfig, DictConfig(validated.env | {"physics": engine}))
+        _check_job(name, model, *job)
+
+
+@cache  # many pages begin with the same command
+def _check_job(name: str, model: Any, *overrides: str) -> None:
+    config = compose(name, overrides, hydra=True)
+    OmegaConf.to_container(config.hydra.launcher, resolve=False)
+    validated = validate(model, OmegaConf.masked_copy(config, [key for key in config if key != "hydra"]))
+    if isinstance(getattr(validated, "env", None), dict):
+        engine = validated.env["physics"] or composed().physics  # None stands for that of the run
+        validate(EnvConfig, DictConfig(validated.env | {"physics": engine}))
 
 
 def _check_node(node: str, given: Sequence[str]) -> None:

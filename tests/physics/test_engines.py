@@ -16,7 +16,7 @@ def test_a_robot_among_64_follows_what_it_follows_alone(spec, make):
     kinds = dynamics(spec, 64), weak(spec, 64), wild(spec, 64, random)
     kind = np.arange(64) * len(kinds) // 64  # a third of the robots each
     parameters = {key: np.choose(kind[:, None], [each[key] for each in kinds]) for key in kinds[0]}
-    velocity_commands = commands(spec, 200, 64, random)
+    velocity_commands = commands(spec, 100, 64, random)
     crowd = make(spec, 64)
     reset_all(crowd, begin, parameters)
     together = run(crowd, velocity_commands)
@@ -35,12 +35,12 @@ def test_a_reset_robot_behaves_exactly_like_a_fresh_one_after_heavy_use(spec, ma
     for _ in range(5):
         some = random.permutation(36)[:7]
         used.reset(some, start(spec, 7, random), wild(spec, 7, random))
-        run(used, commands(spec, 60, 36, random))
+        run(used, commands(spec, 30, 36, random))
     rows = np.array([2, 15, 35])
     begin = start(spec, 3, random)
     for physics in (used, fresh):
         physics.reset(rows, begin, weak(spec, 3))
-    velocity_commands = commands(spec, 100, 36, random)
+    velocity_commands = commands(spec, 50, 36, random)
     np.testing.assert_array_equal(run(used, velocity_commands)[:, :, rows], run(fresh, velocity_commands)[:, :, rows])
 
 
@@ -66,7 +66,7 @@ def test_resetting_some_robots_leaves_the_others_bit_identical(spec, make):
         reset_all(physics, begin, parameters)
     kept = np.array([0, 3, 4, 16, 33])
     others = np.setdiff1d(np.arange(36), kept)
-    for step, command in enumerate(commands(spec, 150, 36, random)):
+    for step, command in enumerate(commands(spec, 75, 36, random)):
         if step % 7 == 0:
             some = random.permutation(others)[:4]
             before = joints(disturbed.robot_state())[:, kept]
@@ -84,14 +84,14 @@ def test_a_restored_state_continues_bit_for_bit_in_a_fresh_instance(spec, make):
     random = np.random.default_rng(0)
     original = make(spec, 34)
     reset_all(original, start(spec, 34, random), wild(spec, 34, random))
-    run(original, commands(spec, 100, 34, random))
+    run(original, commands(spec, 50, 34, random))
     original.reset(np.array([1, 33]), start(spec, 2, random), weak(spec, 2))
     run(original, commands(spec, 33, 34, random))
     restored = make(spec, 34)
     run(restored, commands(spec, 5, 34, random))
     restored.set_state(original.state())
     np.testing.assert_array_equal(joints(restored.robot_state()), joints(original.robot_state()))
-    velocity_commands = commands(spec, 150, 34, random)
+    velocity_commands = commands(spec, 75, 34, random)
     np.testing.assert_array_equal(run(restored, velocity_commands), run(original, velocity_commands))
     for key, value in restored.parameters().items():
         np.testing.assert_array_equal(value, original.parameters()[key])

@@ -201,12 +201,12 @@ def test_a_policy_reaches_the_same_goals_over_ros_as_in_process(start, start_rob
     start_robot()
     here = ["env=reacher", "env.start.spread=[0.0,0.0]", "randomization=none"]
     for arguments in (["physics=ros"], here):
-        command = start.run(evaluate(f"run={run}", "episodes=8", "in_a_row=0", *arguments))
+        command = start.run(evaluate(f"run={run}", "episodes=5", "in_a_row=0", *arguments))
         assert command.wait(280.0) == 0, command.output
     over_ros, in_process = (
         json.loads((run / f"evaluation_{name}_none.json").read_text()) for name in ("ros", "reacher")
     )
     for name, result in (("over ROS", over_ros), ("in process", in_process)):
-        print(f"{name}: {result['success_rate']:.0%} of 8 goals, {result['steps_to_goal']:.1f} steps to goal")
-    assert abs(over_ros["success_rate"] - in_process["success_rate"]) <= 1 / 8 + 1e-9
+        print(f"{name}: {result['success_rate']:.0%} of 5 goals, {result['steps_to_goal']:.1f} steps to goal")
+    assert abs(over_ros["success_rate"] - in_process["success_rate"]) <= 1 / 5 + 1e-9
     assert over_ros["steps_to_goal"] == pytest.approx(in_process["steps_to_goal"], abs=5.0)

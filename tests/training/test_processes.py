@@ -68,7 +68,8 @@ def test_a_run_goes_on_from_a_killed_worker_a_signal_to_all_processes_and_a_kill
     """Each ends all of its processes; then the run ends as one that nothing has disturbed, to the last bit.
 
     Where only the way of collecting differs from multi_sync, a killed worker is enough: of each other end there is a
-    test for the collector alone, or for the default one in tests/training/test_trainer.
+    test for the collector alone, or for the default one in tests/training/test_trainer. That a run of Ray goes on is
+    seen where it loses a computer, for to start Ray once more takes ten seconds.
     """
     run = Run(tmp_path, collector)
 
@@ -94,8 +95,9 @@ def test_a_run_goes_on_from_a_killed_worker_a_signal_to_all_processes_and_a_kill
         run.process.kill()
         run.ends(-signal.SIGKILL)
 
-    resume_here(run.path)
-    assert_same_run(run.path, undisturbed(once, "multi_sync" if collector == "ray" else collector))
+    if collector != "ray":
+        resume_here(run.path)
+        assert_same_run(run.path, undisturbed(once, collector))
 
 
 @pytest.mark.parametrize(
