@@ -117,7 +117,8 @@ def domain() -> Iterator[int]:
 def start(domain: int, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[..., Process]]:
     """Start nodes of physai: ``start("virtual_robot", rate_hz=100)``; they are gone after the test.
 
-    They are forged, which is quick; ``start.run`` runs a command line, such as that of ``node_command``.
+    They are forged, which is quick, and so are commands: ``start.command("ros.demo", "goals=2")``; ``start.run`` runs
+    a command line, such as that of ``node_command``.
     """
     processes: list[Process] = []
     state = tmp_path_factory.mktemp("state")  # no other test's emergency stop
@@ -125,10 +126,15 @@ def start(domain: int, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cal
 
     def start(module: str, *args: str, **parameters: Any) -> Process:
         arguments = node_command(module, *args, **parameters)[3:]  # of which one may be called output
-        processes.append(ForgedProcess(f"physai.ros.{module}", arguments, domain, state, None))
+        processes.append(ForgedProcess(f"physai.ros.{module}", arguments, domain, state))
+        return processes[-1]
+
+    def command(module: str, *arguments: str) -> Process:
+        processes.append(ForgedProcess(f"physai.{module}", arguments, domain, state, imported=False))
         return processes[-1]
 
     start.run = lambda command, env=None: processes.append(Process(command, domain, own | (env or {}))) or processes[-1]
+    start.command = command
     yield start
     with ThreadPoolExecutor() as pool:
         list(pool.map(lambda process: process.end(), processes))

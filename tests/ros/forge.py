@@ -18,10 +18,16 @@ _IMPORTED = (*(f"physai.ros.{node}" for node in NODES), "physai.physics.pybullet
 
 
 class ForgedProcess(Process):
-    """A node of a forge."""
+    """A node or a command of a forge."""
 
     def __init__(
-        self, module: str, arguments: Sequence[str], domain: int, state: Path | None, output: Path | None
+        self,
+        module: str,
+        arguments: Sequence[str],
+        domain: int,
+        state: Path | None,
+        output: Path | None = None,
+        imported: bool = True,
     ) -> None:
         self._forge: Forge = forge_of(*_IMPORTED)
         self._folder = tempfile.TemporaryDirectory(prefix="physai-test-node-")
@@ -30,7 +36,7 @@ class ForgedProcess(Process):
         self._last: list[str] | None = None
         own = {"ROS_DOMAIN_ID": str(domain), "XDG_STATE_HOME": str(state or self._folder.name)}
         log = os.open(output or self._log, os.O_WRONLY | os.O_APPEND)
-        self._pid = self._forge.fork(module, list(map(str, arguments)), Path.cwd(), os.environ | own, log, True)
+        self._pid = self._forge.fork(module, list(map(str, arguments)), Path.cwd(), os.environ | own, log, imported)
         os.close(log)
 
     @property

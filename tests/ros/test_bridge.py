@@ -44,10 +44,6 @@ def run(exported_run, tmp_path):
     return tmp_path / "run"
 
 
-def evaluate(*arguments):
-    return [sys.executable, "-m", "physai.evaluate", *map(str, arguments)]
-
-
 def in_fresh_python(script):
     return subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=120)
 
@@ -167,7 +163,7 @@ def test_the_other_envs_need_no_rclpy():
 
 @pytest.mark.slow
 def test_where_there_is_no_robot_evaluate_says_so_in_one_line(start, run):
-    command = start.run(evaluate(f"run={run}", "physics=ros"))
+    command = start.command("evaluate", f"run={run}", "physics=ros")
     assert command.wait(60.0) == 2
     assert command.says("error:") == "error: no joint state came on /joint_states within 5 s"
     assert not list(run.glob("evaluation_*"))
@@ -176,7 +172,7 @@ def test_where_there_is_no_robot_evaluate_says_so_in_one_line(start, run):
 @pytest.mark.slow
 def test_evaluate_refuses_to_randomize_a_robot_behind_ros(start, start_robot, peer, run):
     start_robot()
-    command = start.run(evaluate(f"run={run}", "physics=ros", "randomization=default"))
+    command = start.command("evaluate", f"run={run}", "physics=ros", "randomization=default")
     assert command.wait(60.0) == 2
     assert "cannot be set; choose randomization=none" in command.says("error:")
     assert not any(any(velocity) for _, velocity in peer.commands)
@@ -186,7 +182,7 @@ def test_evaluate_refuses_to_randomize_a_robot_behind_ros(start, start_robot, pe
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_an_interrupted_evaluation_leaves_a_standing_arm(start, start_robot, peer, run, number, code):
     start_robot()
-    command = start.run(evaluate(f"run={run}", "physics=ros"))
+    command = start.command("evaluate", f"run={run}", "physics=ros")
     wait_for(lambda: any(any(velocity) for _, velocity in peer.commands), 60.0, "a command")
     command.signal(number)
     assert command.wait() == code
@@ -201,7 +197,7 @@ def test_a_policy_reaches_the_same_goals_over_ros_as_in_process(start, start_rob
     start_robot()
     here = ["env=reacher", "env.start.spread=[0.0,0.0]", "randomization=none"]
     for arguments in (["physics=ros"], here):
-        command = start.run(evaluate(f"run={run}", "episodes=5", "in_a_row=0", *arguments))
+        command = start.command("evaluate", f"run={run}", "episodes=5", "in_a_row=0", *arguments)
         assert command.wait(280.0) == 0, command.output
     over_ros, in_process = (
         json.loads((run / f"evaluation_{name}_none.json").read_text()) for name in ("ros", "reacher")

@@ -2,7 +2,6 @@
 
 import os
 import signal
-import sys
 from pathlib import Path
 
 import imageio.v3 as imageio
@@ -13,10 +12,6 @@ from tests.waiting import wait_for
 
 # An arm that is driven may not be late, as it is where other tests start their processes on the same two cores.
 drives = pytest.mark.realtime
-
-
-def demo(*overrides: str) -> list[str]:
-    return [sys.executable, "-m", "physai.ros.demo", *overrides]
 
 
 def children(pid: int) -> list[int]:
@@ -32,7 +27,7 @@ def alive(pid: int) -> bool:
 @drives
 def test_goals_are_reached_and_held_for_three_seconds_and_the_path_is_drawn(start, policy_path, tmp_path):
     picture = tmp_path / "path.png"
-    process = start.run(demo(f"policy_path={policy_path}", f"output={picture}", "goals=2"))
+    process = start.command("ros.demo", f"policy_path={policy_path}", f"output={picture}", "goals=2")
     assert process.wait(150) == 0, process.output
     assert "2 of 2 goals reached, and held for 3 s" in process.output
     image = imageio.imread(picture)
@@ -45,7 +40,7 @@ def test_goals_are_reached_and_held_for_three_seconds_and_the_path_is_drawn(star
 def test_a_policy_that_commands_positions_drives_an_arm_that_takes_them(start, position_run, tmp_path):
     picture = tmp_path / "path.png"
     overrides = (f"policy_path={position_run / 'policy.pt'}", f"output={picture}", "goals=2", "hold=1")
-    process = start.run(demo(*overrides))
+    process = start.command("ros.demo", *overrides)
     assert process.wait(120) == 0, process.output
     assert "2 of 2 goals reached, and held for 1 s" in process.output
     assert picture.is_file()
@@ -56,7 +51,7 @@ def test_a_policy_that_commands_positions_drives_an_arm_that_takes_them(start, p
 def test_an_arm_with_seven_joints_is_driven_to_points_in_space(start, panda_run, tmp_path):
     picture = tmp_path / "path.png"
     overrides = (f"policy_path={panda_run / 'policy.pt'}", f"output={picture}", "goals=2", "hold=1")
-    process = start.run(demo(*overrides))
+    process = start.command("ros.demo", *overrides)
     assert process.wait(120) == 0, process.output
     assert "drives a virtual panda" in process.output
     assert "2 of 2 goals reached, and held for 1 s" in process.output
@@ -67,7 +62,7 @@ def test_an_arm_with_seven_joints_is_driven_to_points_in_space(start, panda_run,
 @pytest.mark.realtime  # it looks for others for a second
 def test_it_refuses_to_start_where_a_robot_is_already(start, policy_path):
     start("virtual_robot").says("takes joint_velocity")
-    process = start.run(demo(f"policy_path={policy_path}"))
+    process = start.command("ros.demo", f"policy_path={policy_path}")
     assert process.wait(60) == 2
     assert process.lines[-1].startswith("error: another node uses /joint")
     assert "ROS_DOMAIN_ID" in process.lines[-1]
@@ -76,7 +71,7 @@ def test_it_refuses_to_start_where_a_robot_is_already(start, policy_path):
 @pytest.mark.slow
 @drives
 def test_it_ends_with_the_reason_where_the_arm_is_stopped_for_good(start, domain, policy_path, tmp_path):
-    process = start.run(demo(f"policy_path={policy_path}", f"output={tmp_path / 'path.png'}"))
+    process = start.command("ros.demo", f"policy_path={policy_path}", f"output={tmp_path / 'path.png'}")
     process.says("sending goals", 120.0)
     peer = Peer(domain, listen_to_commands=False)
     peer.emergency_stop()
@@ -88,7 +83,7 @@ def test_it_ends_with_the_reason_where_the_arm_is_stopped_for_good(start, domain
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
 def test_its_nodes_end_with_it_however_it_ends(start, policy_path, number, tmp_path):
-    process: Process = start.run(demo(f"policy_path={policy_path}", f"output={tmp_path / 'path.png'}"))
+    process: Process = start.command("ros.demo", f"policy_path={policy_path}", f"output={tmp_path / 'path.png'}")
     process.says("sending goals", 120.0)
     nodes = children(process.pid)
     assert len(nodes) == 2

@@ -210,14 +210,10 @@ def test_nodes_that_share_a_process_do_not_start_if_one_of_them_cannot(start):
     assert process.lines[-1].startswith("error: /right: rate_hz: must lie between")
 
 
-def fleet(*overrides: str) -> list[str]:
-    return [sys.executable, "-m", "physai.ros.fleet", *overrides]
-
-
 @pytest.mark.slow
 @pytest.mark.realtime
 def test_the_demo_drives_a_fleet_and_leaves_nothing_behind(start, policy_path):
-    process = start.run(fleet(f"policies=[{policy_path}]", "arms=2", "seconds=12", "randomization=none"))
+    process = start.command("ros.fleet", f"policies=[{policy_path}]", "arms=2", "seconds=12", "randomization=none")
     assert process.wait(120) == 0, process.output
     told = [line for line in process.lines if "goals reached" in line]
     assert len(told) == 2
@@ -226,7 +222,7 @@ def test_the_demo_drives_a_fleet_and_leaves_nothing_behind(start, policy_path):
 
 @pytest.mark.slow
 def test_ctrl_c_ends_the_demo_and_all_of_its_nodes_and_its_page(start, policy_path):
-    process = start.run(fleet(f"policies=[{policy_path}]", "arms=2", "render=web", "web.port=0"))
+    process = start.command("ros.fleet", f"policies=[{policy_path}]", "arms=2", "render=web", "web.port=0")
     process.says("all of them work", 60.0)
     address = process.says("the page: http://127.0.0.1:", 60.0).split()[-1]
     with urllib.request.urlopen(address, timeout=30.0) as page:
@@ -241,7 +237,7 @@ def test_ctrl_c_ends_the_demo_and_all_of_its_nodes_and_its_page(start, policy_pa
 @pytest.mark.slow
 def test_a_namespace_that_has_a_robot_already_is_left_alone(start, policy_path):
     start("virtual_robot", "-r", "__ns:=/arm1").says("takes joint_velocity", 60.0)
-    process = start.run(fleet(f"policies=[{policy_path}]", "arms=1"))
+    process = start.command("ros.fleet", f"policies=[{policy_path}]", "arms=1")
     assert process.wait(120) == 2
     assert "error: another robot tells of itself on /arm1/joint_states" in process.output
 
@@ -266,6 +262,6 @@ def runs(pid: int) -> bool:
     ],
 )
 def test_what_cannot_be_is_one_line(start, policy_path, overrides, said):
-    process = start.run(fleet(f"policies=[{policy_path}]", *overrides))
+    process = start.command("ros.fleet", f"policies=[{policy_path}]", *overrides)
     assert process.wait(60) == 2
     assert f"error: {said}" in process.output
