@@ -10,6 +10,7 @@ import pytest
 from geometry_msgs.msg import PointStamped
 from nav_msgs.msg import Goals
 from rclpy.duration import Duration
+from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message, serialize_message
 from rosbags.rosbag2 import Reader
@@ -43,7 +44,7 @@ def numbers(folder: Path, topic: str = "/numbers") -> list[int]:
     return [message.data for _, message in read(folder, topic, UInt64)] if list(folder.glob("*")) else []
 
 
-def send_numbers(peer, count: int, profile: QoSProfile, first: int = 0, topic: str = "/numbers") -> None:
+def send_numbers(peer, count: int, profile: QoSProfile, first: int = 0, topic: str = "/numbers") -> Publisher:
     publisher = peer.publisher(UInt64, topic, profile)
     wait_for(publisher.get_subscription_count, what="the recorder")
     if profile.reliability is ReliabilityPolicy.BEST_EFFORT:
@@ -52,7 +53,16 @@ def send_numbers(peer, count: int, profile: QoSProfile, first: int = 0, topic: s
     for index in range(count):
         publisher.publish(UInt64(data=first + index))
         time.sleep(max(0.0, begin + (index + 1) / RATE - time.monotonic()))
-    publisher.wait_for_all_acked(Duration(seconds=5))
+    return publisher
+
+
+def have_arrived(*publishers: Publisher) -> None:
+    """Wait for what they sent to arrive; a heartbeat that asks for it comes every three seconds."""
+    for publisher in publishers:
+        if publisher.qos_profile.reliability is ReliabilityPolicy.BEST_EFFORT:
+            time.sleep(0.1)  # no acknowledgement tells
+        else:
+            assert publisher.wait_for_all_acked(Duration(seconds=5))
 
 
 def start_recorder(start, folder: Path, *topics: str):
@@ -75,9 +85,7 @@ def start_recorder(start, folder: Path, *topics: str):
 )
 def test_every_message_is_there_once(start, peer, tmp_path, kind, end):
     recorder = start_recorder(start, tmp_path / "bag", "/numbers")
-    send_numbers(peer, 1000, KINDS[kind])
-    if "best_effort" in kind:  # no acknowledgement tells that they have arrived
-        time.sleep(0.1)
+    have_arrived(send_numbers(peer, 1000, KINDS[kind]))
     recorder.signal(end)
     assert recorder.wait() == 0
     assert numbers(tmp_path / "bag") == list(range(1000))
@@ -94,10 +102,11 @@ def test_publishers_of_all_kinds_share_a_topic(start, peer, tmp_path):
         early.publish(UInt64(data=number))  # before there is a recorder
     recorder = start_recorder(start, tmp_path / "bag", "/numbers")
     recorder.says("the first message")
+    publishers = []
     for first, kind in [(100, "reliable"), (150, "best_effort"), (200, "latched"), (250, "latched_best_effort")]:
-        send_numbers(peer, 25, KINDS[kind], first)
-        send_numbers(peer, 25, KINDS["reliable"], first + 25)
-    time.sleep(0.1)
+        publishers.append(send_numbers(peer, 25, KINDS[kind], first))
+        publishers.append(send_numbers(peer, 25, KINDS["reliable"], first + 25))
+    have_arrived(*publishers)
     recorder.signal(signal.SIGINT)
     assert recorder.wait() == 0
     assert sorted(numbers(tmp_path / "bag")) == [*range(10), *range(100, 300)]
@@ -177,7 +186,7 @@ def test_a_killed_recording_is_completed(start, peer, tmp_path):
     busy = start("record", recover=bag)
     assert busy.wait() == 2
     assert busy.output == f"error: {bag} is still being recorded"
-    send_numbers(peer, 700, KINDS["reliable"])
+    have_arrived(send_numbers(peer, 700, KINDS["reliable"]))
     recorder.signal(signal.SIGKILL)
     recorder.wait()
     assert [path.name for path in bag.iterdir()] == ["bag.mcap"]
@@ -221,7 +230,7 @@ def test_what_cannot_be_recorded_is_named_and_left_out(start, peer, tmp_path):
     recorder.says("recording")
     peer.publisher(DisparityImage, "/disparity")
     peer.publisher(Goals, "/goals")
-    send_numbers(peer, 10, KINDS["reliable"])
+    have_arrived(send_numbers(peer, 10, KINDS["reliable"]))
     recorder.says("/disparity is not heard: 'stereo_msgs/msg/DisparityImage' is not installed here")
     recorder.says("/goals is not heard: 'nav_msgs/msg/Goals' is no message of ROS 2 Jazzy")
     recorder.signal(signal.SIGINT)
