@@ -113,7 +113,7 @@ def test_each_robot_is_driven_and_stopped_for_itself_and_one_topic_stops_all(sta
 def test_one_message_stops_every_robot_at_once(start, peer, policy_path):
     """Many seconds, of which most are waiting: `python -m physai.bench --fleet` measures it with eight robots."""
     robots = fleet_of(start, peer, policy_path, 2)
-    everyone = peer.publisher(Bool, "/emergency_stop")
+    everyone = peer.publisher(Bool, "/emergency_stop", 1)  # of depth 1, it is acknowledged at once
     wait_for(lambda: everyone.get_subscription_count() >= 2 * len(robots))
     late = []
     for trial in range(3):
