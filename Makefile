@@ -60,7 +60,7 @@ test: $(VENV)/.installed-dev chromium  ## Run all tests (ARGS="-m 'not slow'" fo
 	@export PHYSAI_TEST_RUNS=$$(mktemp -d); trap 'rm -rf "$$PHYSAI_TEST_RUNS"' EXIT; \
 	part() { echo "==> Testing $$1"; shift; $(BIN)/python -m pytest "$$@" $(ARGS) || [ $$? = 5 ]; }; \
 	if [ -n "$(findstring not slow,$(ARGS))" ]; then part "what is quick" -n 3 --dist worksteal --realtime=without; exit; fi; \
-	part "what is not ROS" -n 3 --dist worksteal --ignore tests/ros --realtime=without && \
+	part "what is not ROS" -n 2 --dist worksteal --ignore tests/ros --realtime=without && \
 	part "ROS 2 nodes, which mostly wait, side by side" tests/ros -n 4 --dist worksteal --realtime=without && \
 	part "what measures time, four at a time and nothing else" tests/ros tests/bench -n 4 --dist worksteal --realtime=only
 

@@ -220,6 +220,7 @@ def walking_run(once: Callable[[str, Callable[[Path], None]], Path]) -> Path:
         "total_frames=12_288",
         "env.task.max_steps=100",
         "evaluation.goals=20",
+        "evaluation.episodes=40",
     )
     return once("walking_run", partial(_train_and_export, *overrides, formats=["torchscript"]))
 
@@ -232,7 +233,7 @@ def walking_policy(walking_run: Path) -> Policy:
 
 def _train_and_export(*arguments: Any, formats: Sequence[str] = ("torchscript", "onnx")) -> None:
     *overrides, run = arguments
-    node = composed.composed(*overrides, "evaluation.episodes=200", "evaluation.in_a_row=2")
+    node = composed.composed("evaluation.episodes=200", "evaluation.in_a_row=2", *overrides)
     (run / ".hydra").mkdir()
     (run / ".hydra" / "config.yaml").write_text(OmegaConf.to_yaml(node))
     run_training(validate(TrainConfig, node), run)
@@ -241,7 +242,7 @@ def _train_and_export(*arguments: Any, formats: Sequence[str] = ("torchscript", 
 
     config = load_config(run)
     with pytest.MonkeyPatch.context() as patch, open(run / "export.txt", "w") as said, redirect_stdout(said):
-        patch.setattr(module, "TRANSFER_EPISODES", 20 if config.env.robot.floating else 100)  # legs are slow there
+        patch.setattr(module, "TRANSFER_EPISODES", 10 if config.env.robot.floating else 100)  # legs are slow there
         export(run, "best", list(formats), config)
 
 

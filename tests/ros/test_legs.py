@@ -80,10 +80,10 @@ def test_the_virtual_robot_tells_what_its_imu_feels_and_where_it_is(walker):
     assert np.diff(stamps).min() > 0
 
 
-def test_the_demo_walks_past_the_corners_of_a_square_and_draws_the_path(start, walking_run, tmp_path):
+def test_the_demo_walks_past_corners_and_draws_the_path(start, walking_run, tmp_path):
     picture = tmp_path / "path.png"
     overrides = (f"policy_path={walking_run / 'policy.pt'}", f"output={picture}", "randomization=default")
-    process = start.command("ros.demo", *overrides, "goals=4", "hold=1")
+    process = start.command("ros.demo", *overrides, "goals=2", "hold=1")
     assert process.wait(240) == 0, process.output
-    assert "4 of 4 corners passed within 0.5 m" in process.output
+    assert "2 of 2 corners passed within 0.5 m" in process.output
     assert picture.stat().st_size > 10_000

@@ -66,11 +66,11 @@ def test_it_goes_on_from_a_checkpoint_bit_for_bit(finished, tmp_path):
 def test_a_student_passes_the_gate_with_its_memory_and_its_teacher_is_refused(
     finished, teacher_run, tmp_path, monkeypatch
 ):
-    # ten seconds: all stages of the gate, for what a student becomes on a robot
+    # five seconds: all stages of the gate, for what a student becomes on a robot
     monkeypatch.setattr(export, "TRANSFER_EPISODES", 8)
     shutil.copytree(finished, tmp_path / "run")
     stages = {}
-    export.export_policy(tmp_path / "run", "best", ["torchscript", "onnx"], stages.__setitem__, episodes=8)
+    export.export_policy(tmp_path / "run", "best", ["torchscript"], stages.__setitem__, episodes=8)
     assert "over 1,024 steps: to the last bit" in stages["remembers as the policy does"]
     assert read_metadata(tmp_path / "run" / "policy.pt").memory_size == load_config(finished).memory_size == 32 + 4 * 2
     seen = r"a policy that sees 'relative_parameters' cannot be exported, for no robot can tell it"
