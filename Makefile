@@ -55,12 +55,13 @@ chromium:
 
 # The quick tests are one part: none of them measures time. A part of which ARGS choose no test (pytest's exit code 5) is
 # no failure. Who keeps Python from storing what it compiles pays for it in each of the many processes here.
+# On two cores, a fourth worker that computes makes all of them slower; of those that wait, four are best.
 test: export PYTHONDONTWRITEBYTECODE =
 test: $(VENV)/.installed-dev chromium  ## Run all tests (ARGS="-m 'not slow'" for the quick ones)
 	@export PHYSAI_TEST_RUNS=$$(mktemp -d); trap 'rm -rf "$$PHYSAI_TEST_RUNS"' EXIT; \
 	part() { echo "==> Testing $$1"; shift; $(BIN)/python -m pytest "$$@" $(ARGS) || [ $$? = 5 ]; }; \
 	if [ -n "$(findstring not slow,$(ARGS))" ]; then part "what is quick" -n 3 --dist worksteal --realtime=without; exit; fi; \
-	part "what is not ROS" -n 2 --dist worksteal --ignore tests/ros --realtime=without && \
+	part "what is not ROS" -n 3 --dist worksteal --ignore tests/ros --realtime=without && \
 	part "ROS 2 nodes, which mostly wait, side by side" tests/ros -n 4 --dist worksteal --realtime=without && \
 	part "what measures time, four at a time and nothing else" tests/ros tests/bench -n 4 --dist worksteal --realtime=only
 
