@@ -1,5 +1,6 @@
 """The demo: both nodes, goal after goal, and a picture."""
 
+import contextlib
 import os
 import signal
 from pathlib import Path
@@ -73,10 +74,9 @@ def test_it_refuses_to_start_where_a_robot_is_already(start, policy_path):
 def test_it_ends_with_the_reason_where_the_arm_is_stopped_for_good(start, domain, policy_path, tmp_path):
     process = start.command("ros.demo", f"policy_path={policy_path}", f"output={tmp_path / 'path.png'}")
     process.says("sending goals", 120.0)
-    peer = Peer(domain, listen_to_commands=False)
-    peer.emergency_stop()
-    peer.close()
-    assert process.wait() == 2
+    with contextlib.closing(Peer(domain, listen_to_commands=False)) as peer:  # who leaves at once may not be heard
+        peer.emergency_stop()
+        assert process.wait() == 2
     assert process.lines[-1] == "error: the inference node has stopped the robot: estop: emergency stop"
 
 
