@@ -3,7 +3,7 @@
 import gc
 import os
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -118,7 +118,7 @@ def start(domain: int, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cal
     """Start nodes of physai: ``start("virtual_robot", rate_hz=100)``; they are gone after the test.
 
     They are forged, which is quick, and so are commands: ``start.command("ros.demo", "goals=2")``; ``start.run`` runs
-    a command line, such as that of ``node_command``.
+    a command line in a Python of its own, as a user does.
     """
     processes: list[Process] = []
     state = tmp_path_factory.mktemp("state")  # no other test's emergency stop
@@ -133,8 +133,11 @@ def start(domain: int, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cal
         processes.append(ForgedProcess(f"physai.{module}", arguments, domain, state, imported=False))
         return processes[-1]
 
-    start.run = lambda command, env=None: processes.append(Process(command, domain, own | (env or {}))) or processes[-1]
-    start.command = command
+    def run(command: Sequence[str], env: dict[str, str] | None = None) -> Process:
+        processes.append(Process(command, domain, own | (env or {})))
+        return processes[-1]
+
+    start.command, start.run = command, run
     yield start
     with ThreadPoolExecutor() as pool:
         list(pool.map(lambda process: process.end(), processes))

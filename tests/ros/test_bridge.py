@@ -163,7 +163,7 @@ def test_the_other_envs_need_no_rclpy():
 
 @pytest.mark.slow
 def test_where_there_is_no_robot_evaluate_says_so_in_one_line(start, run):
-    command = start.command("evaluate", f"run={run}", "physics=ros")
+    command = start.run([sys.executable, "-m", "physai.evaluate", f"run={run}", "physics=ros"])
     assert command.wait(60.0) == 2
     assert command.says("error:") == "error: no joint state came on /joint_states within 5 s"
     assert not list(run.glob("evaluation_*"))

@@ -3,6 +3,7 @@
 import contextlib
 import os
 import signal
+import sys
 from pathlib import Path
 
 import imageio.v3 as imageio
@@ -63,7 +64,7 @@ def test_an_arm_with_seven_joints_is_driven_to_points_in_space(start, panda_run,
 @pytest.mark.realtime  # it looks for others for a second
 def test_it_refuses_to_start_where_a_robot_is_already(start, policy_path):
     start("virtual_robot").says("takes joint_velocity")
-    process = start.command("ros.demo", f"policy_path={policy_path}")
+    process = start.run([sys.executable, "-m", "physai.ros.demo", f"policy_path={policy_path}"])
     assert process.wait(60) == 2
     assert process.lines[-1].startswith("error: another node uses /joint")
     assert "ROS_DOMAIN_ID" in process.lines[-1]

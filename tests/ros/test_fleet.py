@@ -237,7 +237,7 @@ def test_ctrl_c_ends_the_demo_and_all_of_its_nodes_and_its_page(start, policy_pa
 @pytest.mark.slow
 def test_a_namespace_that_has_a_robot_already_is_left_alone(start, policy_path):
     start("virtual_robot", "-r", "__ns:=/arm1").says("takes joint_velocity", 60.0)
-    process = start.command("ros.fleet", f"policies=[{policy_path}]", "arms=1")
+    process = start.run([sys.executable, "-m", "physai.ros.fleet", f"policies=[{policy_path}]", "arms=1"])
     assert process.wait(120) == 2
     assert "error: another robot tells of itself on /arm1/joint_states" in process.output
 
