@@ -7,9 +7,10 @@ from functools import cache
 from pathlib import Path
 
 from filelock import FileLock
-from omegaconf import DictConfig
+from hydra.core.override_parser.types import Override, OverrideType
+from omegaconf import DictConfig, OmegaConf
 
-from physai.compose import compose, conf_dir
+from physai.compose import compose, conf_dir, parse
 from physai.config import validate
 from physai.envs.simulation import EnvConfig
 from physai.physics import RandomizationConfig
@@ -29,8 +30,21 @@ def _pickled(*overrides: str) -> bytes:
 
 
 def composed(*overrides: str) -> DictConfig:
-    """What a training is composed to, of the caller's own."""
-    return pickle.loads(_pickled(*overrides))
+    """What a training is composed to, of the caller's own.
+
+    Values are put into what the choices are composed to: Hydra does so, too, and composes that again each time.
+    """
+    parsed = {one.input_line: one for one in parse(overrides)}
+    values = {one.key_or_group: one.value() for one in parsed.values() if _is_value(one)}
+    node = pickle.loads(_pickled(*(line for line, one in parsed.items() if not _is_value(one))))
+    for key, value in values.items():
+        OmegaConf.update(node, key, value)
+    return node
+
+
+def _is_value(override: Override) -> bool:
+    plain = override.type == OverrideType.CHANGE and override.package is None
+    return plain and not (conf_dir() / override.key_or_group).is_dir()
 
 
 @cache

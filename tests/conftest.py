@@ -3,10 +3,11 @@
 import gc
 import os
 import runpy
+import shlex
 import shutil
 import signal
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import redirect_stdout
 from functools import partial
 from pathlib import Path
@@ -15,6 +16,12 @@ from typing import Any
 # Workers of pytest have a core each. Libraries read this when they are imported, also in processes that tests start.
 for library in ("OMP", "MKL", "OPENBLAS"):
     os.environ[f"{library}_NUM_THREADS"] = "1"
+
+from tests.forge import close_forge, forge, share_forge
+
+# It imports while this process does, which forks no worker before.
+if "PYTEST_XDIST_WORKER" not in os.environ and any(one.startswith(("-n", "--numprocesses")) for one in sys.argv):
+    forge()
 
 gc.disable()  # until all is imported: what that makes stays, and looking for garbage in it takes a quarter longer
 
@@ -32,7 +39,6 @@ from physai.envs.simulation import EnvConfig
 from physai.training.config import TrainConfig
 from physai.training.run import load_config, run_training
 from tests import composed
-from tests.forge import close_forges
 from tests.training.small import SMALL, TINY, command, run_here
 
 # A shell that starts the tests in the background has them, and whatever they start, take no notice of Ctrl-C.
@@ -48,6 +54,24 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption(
         "--realtime", choices=("only", "without"), help="choose by what measures time (the marker realtime)"
     )
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    if hasattr(config, "workerinput"):
+        share_forge(config.workerinput["forge"])
+    config.add_cleanup(close_forge)
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_setupnodes(specs: Sequence[Any]) -> None:
+    worker = Path(__file__).with_name("worker.py")
+    for spec in specs:
+        spec.python = shlex.join([sys.executable, "-I", "-S", str(worker), forge().path])
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_configure_node(node: Any) -> None:
+    node.workerinput["forge"] = forge().path
 
 
 @pytest.hookimpl(tryfirst=True)
@@ -90,12 +114,6 @@ def run(tmp_path, monkeypatch, capsys):
         return code, *capsys.readouterr()
 
     return run
-
-
-@pytest.fixture(scope="session", autouse=True)
-def _nothing_is_forged_any_more() -> Iterator[None]:
-    yield
-    close_forges()
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -1,62 +1,93 @@
 """Processes of their own that start quickly: what takes longest to import is imported once, and forked.
 
-Run as a program, it forks a process for each order that it reads, and tells when one has ended; they all end with it,
-and it ends with its input.
+A session of tests has one forge, which all of its workers share, and which forks them, too. Run as a program, it
+listens at the socket that is its input, forks a process for each order that comes from there, and tells when one has
+ended. With a worker end the processes that it has ordered, and with the last worker the forge.
 """
 
 import contextlib
 import ctypes
+import functools
 import gc
 import importlib
 import json
 import os
 import runpy
+import selectors
+import shutil
 import signal
 import socket
 import subprocess
 import sys
+import tempfile
 import threading
 import time
+import types
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import IO, Any
 
 from physai.processes import die_with
 
+ROOT = Path(__file__).parent.parent
+# What workers, commands and nodes of ROS import, sooner or later, which takes longer than most of them run.
+IMPORTED = (
+    *("physai.training.run", "physai.cli", "physai.algorithms", "physai.collectors", "physai.physics.pybullet"),
+    *("physai.plots.curriculum", "physai.plots.runs", "scipy.stats", "torch.utils.tensorboard"),
+    *("physai.ros.inference_node", "physai.ros.virtual_robot", "physai.ros.record", "physai.ros.command_watchdog"),
+    *("physai.ros.excite", "physai.web.scene"),
+)
 _LARGEST = 1 << 20  # bytes of an order
 _PATIENCE = 120.0  # s, for what is imported at first
 
 
 class Forge:
-    """The forking process, as the tests see it.
+    """The forge, as one of its clients sees it.
 
     Args:
-        modules: What it imports.
+        path: The socket where it listens; None to start one.
     """
 
-    def __init__(self, modules: Sequence[str]) -> None:
-        self._orders, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        command = [sys.executable, "-m", "tests.forge", *modules]
-        self._popen = subprocess.Popen(
-            command, stdin=theirs, stdout=subprocess.PIPE, text=True, start_new_session=True, cwd=_ROOT
-        )
-        theirs.close()
-        self._pids: list[int] = []
+    def __init__(self, path: str | None = None) -> None:
+        self._folder = None if path else tempfile.mkdtemp(prefix="physai-test-forge-")
+        self.path = path or f"{self._folder}/forge"
         self.codes: dict[int, int] = {}
+        self._popen = self._start() if self._folder else None
+        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self._socket.connect(self.path)
+        self._started: list[int] = []
+        self._gone = False
         self._lock = threading.Lock()
         self._told = threading.Condition()
         threading.Thread(target=self._read, daemon=True).start()
 
+    def _start(self) -> subprocess.Popen[bytes]:
+        with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as listener:
+            listener.bind(self.path)
+            listener.listen(64)  # clients may come before it has imported
+            command = [sys.executable, "-m", "tests.forge"]
+            return subprocess.Popen(
+                command, stdin=listener, stdout=subprocess.DEVNULL, start_new_session=True, cwd=ROOT
+            )
+
+    @property
+    def pid(self) -> int | None:
+        """Of the forge, if this client started it."""
+        return self._popen.pid if self._popen is not None else None
+
     def _read(self) -> None:
-        for line in self._popen.stdout:  # type: ignore[union-attr]
-            what, pid, *code = line.split()
+        while said := self._socket.recv(_LARGEST):
+            what, pid, *code = said.decode().split()
             with self._told:
                 if what == "started":
                     self.codes.pop(int(pid), None)  # of another process that had its number
-                    self._pids.append(int(pid))
+                    self._started.append(int(pid))
                 else:
                     self.codes[int(pid)] = int(code[0])
                 self._told.notify_all()
+        with self._told:
+            self._gone = True
+            self._told.notify_all()
 
     def fork(
         self,
@@ -78,49 +109,62 @@ class Forge:
             imported: Whether the module is imported, perhaps once for all, and its ``main`` called.
         """
         order = {"module": module, "arguments": list(arguments), "cwd": str(cwd), "env": dict(env), "main": imported}
-        with self._lock:
-            count = len(self._pids)
-            socket.send_fds(self._orders, [json.dumps(order).encode()], [output])
+        with self._lock, open(os.devnull) as nothing:
+            count = len(self._started)
+            socket.send_fds(self._socket, [json.dumps(order).encode()], [nothing.fileno(), output, output])
             with self._told:
-                assert self._told.wait_for(lambda: len(self._pids) > count, _PATIENCE), "nothing was forked"
-            return self._pids[count]
+                self._told.wait_for(lambda: len(self._started) > count or self._gone, _PATIENCE)
+                assert len(self._started) > count, "nothing was forked"
+            return self._started[count]
 
     def ended(self, pid: int, timeout: float | None) -> bool:
         """Wait until a process has ended, and return whether it has."""
         with self._told:
-            return self._told.wait_for(lambda: pid in self.codes, timeout)
+            self._told.wait_for(lambda: pid in self.codes or self._gone, timeout)
+            return pid in self.codes
 
     def close(self) -> None:
-        """End it; its processes have ended before."""
-        self._orders.close()
-        self._popen.wait(10)
+        """Leave it: what it has forked for this client has ended, or ends now."""
+        self._socket.shutdown(socket.SHUT_RDWR)
+        self._socket.close()
+        if self._popen is not None and self._folder is not None:
+            self._popen.wait(10)
+            shutil.rmtree(self._folder)
 
 
-_ROOT = Path(__file__).parent.parent
-_forges: dict[tuple[str, ...], Forge] = {}
+_forge: Forge | None = None
 
 
-def forge_of(*modules: str) -> Forge:
-    """Return the forge of this session that has imported these modules."""
-    if modules not in _forges:
-        _forges[modules] = Forge(modules)
-    return _forges[modules]
+def forge() -> Forge:
+    """Return the forge of this session; it starts with who asks first."""
+    global _forge
+    if _forge is None:
+        _forge = Forge()
+    return _forge
 
 
-def close_forges() -> None:
+def share_forge(path: str) -> None:
+    """Use the forge that listens there."""
+    global _forge
+    _forge = Forge(path)
+
+
+def close_forge() -> None:
     """At the end of a session."""
-    while _forges:
-        _forges.popitem()[1].close()
+    global _forge
+    if _forge is not None:
+        _forge.close()
+    _forge = None
 
 
 class Forked:
     """A module that runs in a process of its own: of :class:`subprocess.Popen` what tests need."""
 
-    def __init__(self, forge: Forge, module: str, arguments: Sequence[str], cwd: Path, env: Mapping[str, str]) -> None:
+    def __init__(self, module: str, arguments: Sequence[str], cwd: Path, env: Mapping[str, str]) -> None:
         ours, theirs = os.pipe()
         self.stdout: IO[str] = os.fdopen(ours, encoding="utf-8")
-        self._forge = forge
-        self.pid = forge.fork(module, arguments, cwd, env, theirs)
+        self._forge = forge()
+        self.pid = self._forge.fork(module, arguments, cwd, env, theirs)
         os.close(theirs)
 
     @property
@@ -161,28 +205,22 @@ class Forked:
         self.send_signal(signal.SIGKILL)
 
 
-def _report(*_: Any) -> None:
-    """Tell who has ended; as a signal handler it must not use ``print``."""
-    while True:
-        try:
-            pid, status = os.waitpid(-1, os.WNOHANG)
-        except ChildProcessError:
-            return
-        if not pid:
-            return
-        os.write(1, f"ended {pid} {os.waitstatus_to_exitcode(status)}\n".encode())
-
-
-def _become(order: dict[str, Any], output: int, forge: int) -> None:
+def _become(order: dict[str, Any], files: Sequence[int], forge: int) -> None:
+    """Be the process that was ordered; its standard files are those that came with the order."""
     die_with(forge)
     os.setsid()
-    signal.signal(signal.SIGCHLD, signal.SIG_DFL)
-    for number, target in ((os.open(os.devnull, os.O_RDONLY), 0), (output, 1), (output, 2)):
+    for target, number in enumerate(files):
         os.dup2(number, target)
-    os.close(output)
+    for number in set(files):
+        os.close(number)
     os.environ.clear()
     os.environ.update(order["env"])
     os.chdir(order["cwd"])
+    if "code" in order:  # a worker
+        sys.argv, sys.path[0] = ["-c"], ""
+        sys.modules["__main__"] = main = types.ModuleType("__main__")
+        exec(order["code"], vars(main))
+        sys.exit()
     sys.path[0] = order["cwd"]  # as for python -m
     sys.argv = [order["module"], *order["arguments"]]
     if order["main"]:
@@ -191,37 +229,91 @@ def _become(order: dict[str, Any], output: int, forge: int) -> None:
     sys.exit()
 
 
-def _import(modules: Sequence[str]) -> None:
+class _Smithy:
+    """What the forge itself does: take orders, fork, and tell of ends."""
+
+    def __init__(self, listener: socket.socket) -> None:
+        self._pid = os.getpid()
+        self._listener = listener
+        self._children: dict[int, socket.socket] = {}
+        self._selector = selectors.DefaultSelector()
+        self._selector.register(listener, selectors.EVENT_READ, self._welcome)
+        self._ends, written = socket.socketpair()
+        self._written = written
+        for end in (self._ends, written):
+            end.setblocking(False)
+        self._selector.register(self._ends, selectors.EVENT_READ, self._report)
+        signal.signal(signal.SIGCHLD, lambda *_: None)
+        signal.set_wakeup_fd(written.fileno(), warn_on_full_buffer=False)
+        self._clients: set[socket.socket] = set()
+
+    def serve(self) -> None:
+        """Until the last client has left."""
+        self._welcome()
+        while self._clients:
+            for key, _ in self._selector.select():
+                key.data()
+
+    def _welcome(self) -> None:
+        client, _ = self._listener.accept()
+        self._clients.add(client)
+        self._selector.register(client, selectors.EVENT_READ, functools.partial(self._obey, client))
+
+    def _obey(self, client: socket.socket) -> None:
+        try:
+            data, files, _, _ = socket.recv_fds(client, _LARGEST, 3)
+        except ConnectionResetError:
+            data = b""
+        if not data:
+            self._selector.unregister(client)
+            self._clients.remove(client)
+            client.close()
+            for pid in [pid for pid, owner in self._children.items() if owner is client]:
+                os.kill(pid, signal.SIGKILL)
+            return
+        pid = os.fork()
+        if not pid:
+            self._forget()
+            _become(json.loads(data), files, self._pid)
+        for number in files:
+            os.close(number)
+        self._children[pid] = client
+        self._tell(client, f"started {pid}")
+
+    def _report(self) -> None:
+        with contextlib.suppress(BlockingIOError):
+            self._ends.recv(_LARGEST)
+        while self._children:
+            pid, status = os.waitpid(-1, os.WNOHANG)
+            if not pid:
+                return
+            self._tell(self._children.pop(pid), f"ended {pid} {os.waitstatus_to_exitcode(status)}")
+
+    def _tell(self, client: socket.socket, line: str) -> None:
+        if client in self._clients:
+            with contextlib.suppress(BrokenPipeError):  # it has just left
+                client.send(line.encode())
+
+    def _forget(self) -> None:
+        """In the new process, which has no business with any of these."""
+        signal.set_wakeup_fd(-1)
+        signal.signal(signal.SIGCHLD, signal.SIG_DFL)
+        self._selector.close()
+        for one in (self._listener, self._ends, self._written, *self._clients):
+            one.close()
+
+
+def _import() -> None:
     """PyBullet prints a line, of which neither the tests nor each process shall hear."""
-    stdout = os.dup(1)
-    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
     gc.disable()
-    for module in modules:
+    for module in IMPORTED:
         importlib.import_module(module)
     gc.freeze()  # no process looks for garbage in what is imported
     gc.enable()
     ctypes.CDLL(None).fflush(None)
-    os.dup2(stdout, 1)
-    os.close(stdout)
-
-
-def _forge(modules: Sequence[str]) -> None:
-    _import(modules)
-    forge, orders = os.getpid(), socket.socket(fileno=0)
-    signal.signal(signal.SIGCHLD, _report)
-    while True:
-        data, outputs, _, _ = socket.recv_fds(orders, _LARGEST, 1)
-        if not data:
-            return
-        signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGCHLD])  # "started" comes first
-        pid = os.fork()
-        if not pid:
-            signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGCHLD])
-            _become(json.loads(data), outputs[0], forge)
-        os.close(outputs[0])
-        os.write(1, f"started {pid}\n".encode())
-        signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGCHLD])
 
 
 if __name__ == "__main__":
-    _forge(sys.argv[1:])
+    with socket.socket(fileno=0) as socket_here:
+        _import()
+        _Smithy(socket_here).serve()

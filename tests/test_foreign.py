@@ -11,13 +11,14 @@ import pytest
 from omegaconf import OmegaConf
 
 from physai import artifact, cli, foreign, train
-from physai.compose import compose, conf_dir
+from physai.compose import conf_dir
 from physai.config import validate
 from physai.errors import UserError
 from physai.plots.runs import plot_runs
 from physai.training.config import TrainConfig
 from physai.training.run import TrainedPolicy, load_config, run_training
 from tests import malicious
+from tests.composed import composed
 from tests.training.small import SMALL, command
 
 TINY = (*SMALL, "total_frames=2048", "checkpoint.every_frames=1024", "evaluation.goals=4", "evaluation.episodes=4")
@@ -27,7 +28,7 @@ TINY = (*SMALL, "total_frames=2048", "checkpoint.every_frames=1024", "evaluation
 def finished(tmp_path_factory) -> Path:
     """A run that is complete but for its summary, so that it can be resumed."""
     folder = tmp_path_factory.mktemp("foreign") / "run"
-    node = compose("train", TINY)
+    node = composed(*TINY)
     (folder / ".hydra").mkdir(parents=True)
     (folder / ".hydra" / "config.yaml").write_text(OmegaConf.to_yaml(node))
     (folder / ".hydra" / "overrides.yaml").write_text(OmegaConf.to_yaml(OmegaConf.create(list(TINY))))
@@ -191,7 +192,7 @@ def test_a_run_of_ones_own_parts_is_judged_and_exported_where_it_was_trained(own
      for path in sorted((conf_dir() / group).glob("*.yaml"))] + ["env=kuka_reacher"],
 )  # fmt: skip
 def test_whatever_conf_offers_passes(choice):
-    node = compose("train", [choice])
+    node = composed(choice)
     plain = foreign.checked(OmegaConf.to_container(node), Path("config.yaml"), resume=True)
     assert plain == OmegaConf.to_container(node, resolve=True)
 

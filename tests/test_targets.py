@@ -3,10 +3,10 @@
 import pytest
 from omegaconf import OmegaConf
 
-from physai.compose import compose
 from physai.errors import UserError
 from physai.targets import find
 from physai.train import Training
+from tests.composed import composed
 
 TINY = ("collector=single", "collector.num_envs=4", "collector.frames_per_batch=64", "algo.minibatch_size=32")
 MODULES = {
@@ -64,7 +64,7 @@ KEYS = ["env.task", "physics", "algo", "algo.loss", "algo.buffer.sampler", "algo
 @pytest.mark.parametrize("name", ["bad_kinds.Other", "bad_kinds.fails", "torch.nn.Identity", "builtins.dict", 7])
 @pytest.mark.parametrize("key", KEYS)
 def test_a_part_of_another_kind_is_one_line(key, name):
-    node = compose("train", TINY)
+    node = composed(*TINY)
     OmegaConf.update(node, key, {"_target_": name}, merge=False)
     with pytest.raises(UserError) as error:
         Training().check(node)

@@ -8,9 +8,9 @@ import pytest
 
 from physai import train
 from physai.cli import command as cli
-from physai.compose import compose
 from physai.errors import UserError
 from physai.training.agent import Agent
+from tests.composed import composed
 from tests.training.small import SMALL
 
 AT_HELP = """
@@ -78,7 +78,7 @@ def training(monkeypatch):
 
 def test_what_was_checked_is_what_a_run_trains(training, tmp_path):
     command, trained = training(keep=True)
-    node = compose("train", SMALL)
+    node = composed(*SMALL)
     command.check(node)
     command.train(node, tmp_path)
     command.train(node, tmp_path)
@@ -91,7 +91,7 @@ def test_the_jobs_of_a_sweep_build_their_own_and_its_check_keeps_no_robots(train
     command, trained = training(keep=False)
     built, build = [], Agent.build
     monkeypatch.setattr(Agent, "build", lambda config: built.append(build(config)) or built[-1])
-    nodes = [compose("train", [*SMALL, f"seed={seed}"]) for seed in (0, 1)]
+    nodes = [composed(*SMALL, f"seed={seed}") for seed in (0, 1)]
     for node in nodes:
         command.check(node)
     assert [agent.env.simulation.physics._worlds for agent in built] == [[], []]

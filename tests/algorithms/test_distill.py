@@ -8,10 +8,10 @@ from hydra.utils import instantiate
 from tensordict import TensorDict
 
 from physai.algorithms import Networks, Teacher
-from physai.compose import compose
 from physai.errors import UserError
 from physai.policies import Critic, DeterministicActor, GaussianActor, GRUActor
 from physai.transforms.normalization import Normalizer
+from tests.composed import composed
 
 ROWS, STEPS, MEMORY = 64, 6, 8
 
@@ -34,7 +34,7 @@ def make_student(remembers=True, seed=3):
 
 def build(student, teacher, *overrides, frames=ROWS * STEPS):
     sizes = [f"collector.frames_per_batch={frames}", f"collector.num_envs={ROWS}", "algo.minibatch_size=96"]
-    node = compose("train", ["algo=distill", "algo.teacher=elsewhere", *sizes, *overrides]).algo
+    node = composed("algo=distill", "algo.teacher=elsewhere", *sizes, *overrides).algo
     networks = Networks(
         student, Critic(1, ["normalized_observation"], [2], "torch.nn.Tanh"), Normalizer(1, 10.0), lambda: None
     )

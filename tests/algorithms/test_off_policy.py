@@ -1,6 +1,5 @@
 """Targets against numbers worked out by hand, what is remembered and drawn, and going on from a saved state."""
 
-import functools
 import itertools
 import math
 
@@ -9,13 +8,13 @@ import torch
 from tensordict import TensorDict
 
 from physai.algorithms import NonFiniteError
-from physai.compose import compose
 from physai.errors import UserError
 from physai.policies import Critic, DeterministicActor, TanhGaussianActor
 from physai.training import checkpoint
 from physai.training.agent import Agent
 from physai.transforms.normalization import Normalizer
 from tests.algorithms.assemble import assemble
+from tests.composed import composed
 from tests.training.small import small_config
 
 ALGORITHMS = ("sac", "td3", "ddpg")
@@ -26,7 +25,6 @@ SMALL = (
     "algo.warmup_frames=32",
     "algo.buffer.storage.max_size=96",
 )
-composed = functools.cache(lambda *overrides: compose("train", overrides).algo)
 PRIORITIZED = (
     "algo.buffer.sampler._target_=physai.algorithms.ProportionalSampler",
     "+algo.buffer.sampler={alpha:0.7,beta:0.5}",
@@ -43,7 +41,7 @@ def build(name, *overrides, actor=None, critic=None, normalizer=None, seed=0):
     actor = actor or DeterministicActor(2, 1, seen, [8], "torch.nn.ReLU", 0.2)
     critic = critic or Critic(3, [*seen, "action"], [8], "torch.nn.ReLU")
     return assemble(
-        composed(f"algo={name}", *SMALL, *overrides), actor, critic, FRAMES, normalizer or Normalizer(2, 10.0)
+        composed(f"algo={name}", *SMALL, *overrides).algo, actor, critic, FRAMES, normalizer or Normalizer(2, 10.0)
     )
 
 

@@ -9,13 +9,13 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from physai.algorithms import NonFiniteError, OnPolicy
-from physai.compose import compose
 from physai.config import validate
 from physai.errors import UserError
 from physai.policies import Critic, GaussianActor
 from physai.training.agent import Agent
 from physai.training.config import TrainConfig
 from tests.algorithms.assemble import assemble
+from tests.composed import composed
 
 GAMMA, LAMBDA = 0.9, 0.8
 
@@ -35,7 +35,7 @@ class ReadValue(TensorDictModuleBase):
 
 
 def build(actor, critic, frames, *overrides):
-    node = compose("train", [f"collector.frames_per_batch={frames}", f"algo.minibatch_size={frames}", *overrides])
+    node = composed(f"collector.frames_per_batch={frames}", f"algo.minibatch_size={frames}", *overrides)
     return assemble(node.algo, actor, critic, frames)
 
 
@@ -182,7 +182,7 @@ def test_a_loss_that_does_not_say_how_far_the_policy_moves_cannot_be_followed():
 
 def test_with_symmetry_each_minibatch_comes_with_its_mirror_image():
     actor, critic, batch = small_batch()
-    node = compose("train", ["collector.frames_per_batch=32", "algo.minibatch_size=8", "algo.symmetry=true"]).algo
+    node = composed("collector.frames_per_batch=32", "algo.minibatch_size=8", "algo.symmetry=true").algo
 
     def mirror(frames):
         assert "next" not in frames.keys()  # noqa: SIM118 (of a TensorDict)
@@ -202,9 +202,9 @@ def test_with_symmetry_each_minibatch_comes_with_its_mirror_image():
 
 def test_there_is_no_symmetry_without_legs_and_none_with_a_memory():
     with pytest.raises(UserError, match=r"algo\.symmetry: robot 'planar_arm' stands on no legs: it has no other side"):
-        Agent.build(validate(TrainConfig, compose("train", ["algo.symmetry=true"])))
+        Agent.build(validate(TrainConfig, composed("algo.symmetry=true")))
     with pytest.raises(UserError, match=r"algo\.symmetry: what an actor remembers has no mirror image"):
-        Agent.build(validate(TrainConfig, compose("train", ["algo.symmetry=true", "policy=gru"])))
+        Agent.build(validate(TrainConfig, composed("algo.symmetry=true", "policy=gru")))
 
 
 def test_a_loss_that_is_not_finite_stops_before_the_step_and_hands_over_the_batch():
@@ -252,7 +252,7 @@ def _saved(state):
 
 def test_a_minibatch_larger_than_the_batch_is_refused():
     actor, critic, _ = small_batch()
-    node = compose("train", ["collector.frames_per_batch=4096", "algo.minibatch_size=5000"])
+    node = composed("collector.frames_per_batch=4096", "algo.minibatch_size=5000")
     with pytest.raises(UserError, match="minibatch of 5000 is larger"):
         assemble(node.algo, actor, critic, 4096)
 

@@ -7,9 +7,9 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.objectives import ClipPPOLoss
 
 from physai.algorithms import FusedClipPPOLoss
-from physai.compose import compose
 from physai.policies import Critic, GaussianActor
 from tests.algorithms.assemble import assemble
+from tests.composed import composed
 
 SETTINGS = {"clip_epsilon": 0.1, "entropy_coeff": 0.03, "critic_coeff": 0.7}
 
@@ -55,7 +55,7 @@ def test_torchrl_s_loss_can_be_put_in_its_place_by_config(parts):
     swap = ["algo.loss._target_=torchrl.objectives.ClipPPOLoss", "+algo.loss.loss_critic_type=l2"]
     results = []
     for overrides in ([], swap):
-        node = compose("train", ["collector.frames_per_batch=64", "algo.minibatch_size=64", *overrides])
+        node = composed("collector.frames_per_batch=64", "algo.minibatch_size=64", *overrides)
         algorithm = assemble(node.algo, actor, critic, 64)
         results.append(algorithm.loss(frames))
     assert type(algorithm.loss) is ClipPPOLoss

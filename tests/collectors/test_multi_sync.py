@@ -10,8 +10,7 @@ import torch
 from physai.errors import UserError
 from tests.collectors.parts import assert_equal
 from tests.docs.blocks import ROOT
-from tests.forge import Forked, forge_of
-from tests.training.small import IMPORTED
+from tests.forge import Forked
 from tests.waiting import wait_for
 
 
@@ -105,7 +104,7 @@ def is_alive(pid):
 @pytest.mark.skipif(sys.platform != "linux", reason="a signal at the death of the parent is Linux's")
 @pytest.mark.parametrize("kind", ["multi_sync", "multi_async"])
 def test_workers_die_with_a_learner_that_is_killed(kind):
-    learner = Forked(forge_of(*IMPORTED), "tests.collectors.learner", [kind], ROOT, os.environ)
+    learner = Forked("tests.collectors.learner", [kind], ROOT, os.environ)
     workers = []
     while len(workers) != 2:
         workers = [int(word) for word in learner.stdout.readline().split() if word.isdigit()]

@@ -6,11 +6,11 @@ What is drawn: tests/transforms/test_randomization.py.
 import pytest
 import torch
 
-from physai.compose import compose
 from physai.config import validate
 from physai.errors import UserError
 from physai.physics import ParameterLayout, RandomizationConfig
 from physai.robots import RobotSpec
+from tests.composed import composed
 
 
 @pytest.fixture(scope="module")
@@ -24,7 +24,7 @@ def kuka(kuka_reacher):
 
 
 def config(*overrides):
-    return validate(RandomizationConfig, compose("train", overrides).randomization)
+    return validate(RandomizationConfig, composed(*overrides).randomization)
 
 
 def drawn(name, operation):

@@ -4,18 +4,19 @@ import numpy as np
 import pytest
 import torch
 
-from physai.compose import compose, conf_dir
+from physai.compose import conf_dir
 from physai.config import validate
 from physai.envs.simulation import EnvConfig
 from physai.errors import UserError
 from physai.robots import ForwardKinematics, RobotConfig, RobotSpec
 from physai.robots.shapes import collision_parts
+from tests.composed import composed
 
 FITTED = sorted(path.stem for path in (conf_dir() / "robot" / "collision").glob("*.yaml"))
 
 
 def config_of(robot: str) -> RobotConfig:
-    return validate(EnvConfig, compose("train", [f"robot@env.robot={robot}"]).env).robot
+    return validate(EnvConfig, composed(f"robot@env.robot={robot}").env).robot
 
 
 def changed(config: RobotConfig, collision: dict | None) -> RobotSpec:

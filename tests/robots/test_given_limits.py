@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from omegaconf import OmegaConf
 
-from physai.compose import compose
 from physai.config import validate
 from physai.envs.simulation import EnvConfig, Simulation
 from physai.errors import UserError
 from physai.robots import RobotSpec
+from tests.composed import composed
 from tests.docs.blocks import shown_files
 
 
@@ -25,7 +25,7 @@ def config(cheetah):
     """Compose the config of an env with it, and with changes to it."""
 
     def config(physics="mujoco", **changes):
-        node = compose("train", ["env=a1_walk", f"physics={physics}", "env.task.stand=1.0", "env.start.spread=0.0"])
+        node = composed("env=a1_walk", f"physics={physics}", "env.task.stand=1.0", "env.start.spread=0.0")
         robot = OmegaConf.merge(OmegaConf.to_container(node.env.robot), cheetah, changes)
         OmegaConf.update(node, "env.robot", robot, force_add=True)
         return validate(EnvConfig, node.env)

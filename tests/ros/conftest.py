@@ -17,7 +17,7 @@ from physai.ros.node.run import prepare_middleware
 
 prepare_middleware()
 
-from tests.forge import close_forges
+from tests.forge import close_forge
 from tests.ros.forge import ForgedProcess
 from tests.ros.loop import Loop, closed_loop
 from tests.ros.peer import SHM, Peer, Process, free_domain, node_command, remove_dead_segments
@@ -100,7 +100,7 @@ def _no_shared_memory_left() -> Iterator[None]:
     """Nodes that are killed, as many here are, leave segments behind; LTTng leaves its own after everyone."""
     traced = set(SHM.glob("lttng-ust-wait*"))
     yield
-    close_forges()  # before their segments are looked for
+    close_forge()  # before their segments are looked for
     remove_dead_segments()
     for path in set(SHM.glob("lttng-ust-wait*")) - traced:
         path.unlink(missing_ok=True)

@@ -8,17 +8,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from tests.forge import Forge, forge_of
+from tests.forge import forge
 from tests.ros.peer import Process, node_command
 from tests.waiting import wait_for
 
-NODES = ("inference_node", "virtual_robot", "record", "command_watchdog", "excite")
-# A virtual robot imports its engine by its name.
-_IMPORTED = (*(f"physai.ros.{node}" for node in NODES), "physai.physics.pybullet")
-
 
 class ForgedProcess(Process):
-    """A node or a command of a forge."""
+    """A node or a command of the forge."""
 
     def __init__(
         self,
@@ -29,7 +25,7 @@ class ForgedProcess(Process):
         output: Path | None = None,
         imported: bool = True,
     ) -> None:
-        self._forge: Forge = forge_of(*_IMPORTED)
+        self._forge = forge()
         self._folder = tempfile.TemporaryDirectory(prefix="physai-test-node-")
         self._log = Path(self._folder.name) / "log"
         self._log.touch()

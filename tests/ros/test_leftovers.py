@@ -31,7 +31,7 @@ def test_fails_with_nodes_that_run(start, peer):
         loop.peer.moved()
         nodes.append(loop.node)
         found = set().union(*(mapped_segments(str(pid)) for pid in [os.getpid(), *(node.pid for node in nodes)]))
-        report = {"pids": [os.getpid(), loop.node._forge._popen.pid] + [node.pid for node in nodes]}
+        report = {"pids": [os.getpid(), loop.node._forge.pid] + [node.pid for node in nodes]}
         Path(os.environ["REPORT"]).write_text(json.dumps(report | {"segments": sorted(map(str, found))}))
         nodes[1].signal(signal.SIGKILL)
         nodes[0].signal(signal.SIGSTOP)  # the others run, one of them forged

@@ -9,6 +9,7 @@ from physai.errors import UserError
 from physai.search import space
 from physai.search.config import SearchConfig
 from physai.training.config import TrainConfig
+from tests.composed import composed
 
 READY = sorted(path.stem for path in (conf_dir() / "search").glob("*.yaml"))
 
@@ -23,7 +24,7 @@ def test_every_choice_and_both_ends_of_every_ready_range_fit_their_algorithm(nam
     found = space.make_space(ready(f"algo={name}"))
     assert len(found) >= 5
     for values in space.samples(found):
-        validate(TrainConfig, compose("train", [f"algo={name}", *space.overrides(values)]))
+        validate(TrainConfig, composed(f"algo={name}", *space.overrides(values)))
 
 
 def test_what_the_command_line_says_goes_before_the_ready_ranges():
@@ -78,6 +79,6 @@ def test_a_bad_range_is_named_in_one_line(text, reason):
 
 def test_values_are_overrides_that_the_command_line_takes():
     found = space.make_space({"policy.actor.hidden_sizes": "choice([64,64],[128])", "export.formats": "choice([])"})
-    config = compose("train", space.overrides(space.samples(found)[1]))
+    config = composed(*space.overrides(space.samples(found)[1]))
     assert config.policy.actor.hidden_sizes == [128]
     assert config.export.formats == []

@@ -9,14 +9,13 @@ from pathlib import Path
 
 from omegaconf import OmegaConf
 
-from physai.compose import compose
 from physai.config import validate
 from physai.training.agent import Agent
 from physai.training.callbacks import EvaluationCallback
 from physai.training.config import TrainConfig
 from physai.training.run import load_config, make_trainer, run_training
 from tests.composed import composed
-from tests.forge import Forked, forge_of
+from tests.forge import Forked
 
 SMALL = (
     "total_frames=8192",
@@ -55,16 +54,9 @@ def small_config(*overrides: str) -> TrainConfig:
     return validate(TrainConfig, composed(*SMALL, *overrides))
 
 
-# What training imports, sooner or later, which takes longer than most commands run.
-IMPORTED = (
-    *("physai.training.run", "physai.cli", "physai.algorithms", "physai.collectors", "physai.physics.pybullet"),
-    *("physai.plots.curriculum", "physai.plots.runs", "scipy.stats", "torch.utils.tensorboard"),
-)
-
-
 def command(module: str, *arguments: str, cwd: Path) -> Forked:
     """Start a physai command as a user would, in a process and a session of its own."""
-    return Forked(forge_of(*IMPORTED), f"physai.{module}", arguments, cwd, os.environ | {"COLUMNS": "200"})
+    return Forked(f"physai.{module}", arguments, cwd, os.environ | {"COLUMNS": "200"})
 
 
 def metrics(run: Path) -> list[dict[str, str]]:
@@ -76,7 +68,7 @@ def metrics(run: Path) -> list[dict[str, str]]:
 def run_here(run: Path, *overrides: str) -> None:
     """Train in this process, which has imported everything already, in a folder that is not there yet."""
     (run / ".hydra").mkdir(parents=True)
-    node = compose("train", overrides)
+    node = composed(*overrides)
     (run / ".hydra" / "config.yaml").write_text(OmegaConf.to_yaml(node))
     run_training(validate(TrainConfig, node), run)
 

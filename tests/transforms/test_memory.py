@@ -6,11 +6,11 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.envs.utils import check_env_specs
 
 from physai.collectors import make_collector
-from physai.compose import compose
 from physai.config import validate
 from physai.envs.make import make_env
 from physai.training.config import TrainConfig
 from physai.transforms import Memory
+from tests.composed import composed
 
 SIZE = 3
 
@@ -31,7 +31,7 @@ class Counting(TensorDictModuleBase):
 def robots(env_config):
     """Make envs whose episodes end now and then, and are over after the test."""
     made = []
-    node = compose("train", ["randomization=strong", "env.task.tolerance=0.1", "env.task.max_steps=13"])
+    node = composed("randomization=strong", "env.task.tolerance=0.1", "env.task.max_steps=13")
     config = validate(TrainConfig, node)
 
     def make(num_envs=16, seed=0, memory_size=SIZE):
