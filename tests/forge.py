@@ -5,6 +5,7 @@ listens at the socket that is its input, forks a process for each order that com
 ended. With a worker end the processes that it has ordered, and with the last worker the forge.
 """
 
+import atexit
 import contextlib
 import ctypes
 import functools
@@ -209,6 +210,7 @@ def _become(order: dict[str, Any], files: Sequence[int], forge: int) -> None:
     """Be the process that was ordered; its standard files are those that came with the order."""
     die_with(forge)
     os.setsid()
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell that started it in the background ignores it
     for target, number in enumerate(files):
         os.dup2(number, target)
     for number in set(files):
@@ -216,6 +218,15 @@ def _become(order: dict[str, Any], files: Sequence[int], forge: int) -> None:
     os.environ.clear()
     os.environ.update(order["env"])
     os.chdir(order["cwd"])
+    try:
+        _run(order)
+    except SystemExit as stop:
+        if stop.code is None or isinstance(stop.code, int):  # words are for Python to print
+            _leave_with(stop.code or 0)
+        raise
+
+
+def _run(order: dict[str, Any]) -> None:
     if "code" in order:  # a worker
         sys.argv, sys.path[0] = ["-c"], ""
         sys.modules["__main__"] = main = types.ModuleType("__main__")
@@ -227,6 +238,23 @@ def _become(order: dict[str, Any], files: Sequence[int], forge: int) -> None:
         sys.exit(importlib.import_module(order["module"]).main())
     runpy.run_module(order["module"], run_name="__main__", alter_sys=True)
     sys.exit()
+
+
+def _leave_with(code: int | None) -> None:
+    """Choose the exit code; with one, nobody clears away what is imported, which takes Python half a second."""
+    global _code
+    _code = code
+
+
+def _leave() -> None:
+    if _code is not None:
+        for stream in (sys.stdout, sys.stderr):
+            with contextlib.suppress(OSError, ValueError):  # nobody reads it any more, or it is closed
+                stream.flush()
+        os._exit(_code % 256)
+
+
+_code: int | None = None
 
 
 class _Smithy:
@@ -314,6 +342,8 @@ def _import() -> None:
 
 
 if __name__ == "__main__":
+    atexit.register(_leave)  # the first, so that it comes last
     with socket.socket(fileno=0) as socket_here:
         _import()
         _Smithy(socket_here).serve()
+    _leave_with(0)
