@@ -30,21 +30,26 @@ def _pickled(*overrides: str) -> bytes:
 
 
 def composed(*overrides: str) -> DictConfig:
-    """What a training is composed to, of the caller's own.
+    """What a training is composed to, of the caller's own; not for files of one's own, which may change.
 
-    Values are put into what the choices are composed to: Hydra does so, too, and composes that again each time.
+    Hydra composes only the choices, once; plain values are set in a copy, as Hydra would.
     """
-    parsed = {one.input_line: one for one in parse(overrides)}
-    values = {one.key_or_group: one.value() for one in parsed.values() if _is_value(one)}
-    node = pickle.loads(_pickled(*(line for line, one in parsed.items() if not _is_value(one))))
-    for key, value in values.items():
-        OmegaConf.update(node, key, value)
+    parsed = parse(overrides)
+    if not all(_is_plain(one) for one in parsed):
+        return pickle.loads(_pickled(*overrides))
+    node = pickle.loads(_pickled(*(one.input_line for one in parsed if _is_choice(one))))
+    for one in parsed:
+        if not _is_choice(one):
+            OmegaConf.update(node, one.key_or_group, one.value())
     return node
 
 
-def _is_value(override: Override) -> bool:
-    plain = override.type == OverrideType.CHANGE and override.package is None
-    return plain and not (conf_dir() / override.key_or_group).is_dir()
+def _is_plain(override: Override) -> bool:
+    return override.type == OverrideType.CHANGE and not override.is_hydra_override()
+
+
+def _is_choice(override: Override) -> bool:
+    return override.package is not None or (conf_dir() / override.key_or_group).is_dir()
 
 
 @cache

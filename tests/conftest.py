@@ -19,7 +19,7 @@ for library in ("OMP", "MKL", "OPENBLAS"):
 
 from tests.forge import close_forge, forge, share_forge
 
-# It imports while this process does, which forks no worker before.
+# Started first, it imports side by side with this process, which needs it for its workers.
 if "PYTEST_XDIST_WORKER" not in os.environ and any(one.startswith(("-n", "--numprocesses")) for one in sys.argv):
     forge()
 
@@ -66,6 +66,8 @@ def pytest_configure(config: pytest.Config) -> None:
 def pytest_xdist_setupnodes(specs: Sequence[Any]) -> None:
     worker = Path(__file__).with_name("worker.py")
     for spec in specs:
+        if not spec.popen or spec.python:
+            continue  # another computer, or another Python
         spec.python = shlex.join([sys.executable, "-I", "-S", str(worker), forge().path])
 
 

@@ -1,4 +1,4 @@
-"""What pytest-xdist starts instead of Python: one that the session's forge forks, which has imported already.
+"""What pytest-xdist starts instead of Python: the fork server of the session forks one, which has imported already.
 
 ``worker.py SOCKET -u -c CODE`` stays until that has ended, and that ends with it.
 """
@@ -10,13 +10,14 @@ import socket
 import sys
 
 if __name__ == "__main__":
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for who started it
-    order = {"code": sys.argv[-1], "cwd": os.getcwd(), "env": dict(os.environ)}
-    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as forge:
-        forge.connect(sys.argv[1])
-        socket.send_fds(forge, [json.dumps(order).encode()], [0, 1, 2])
-        while said := forge.recv(100):
-            what, _, *code = said.split()
-            if what == b"ended":
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    order = {"code": sys.argv[-1], "cwd": os.getcwd(), "env": dict(os.environ), "finalize": False}
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as server:
+        server.connect(sys.argv[1])
+        socket.send_fds(server, [json.dumps(order).encode()], [0, 1, 2])
+        while said := server.recv(100).decode():
+            what, pid, *code = said.split()
+            if what == "ended":
                 sys.exit(int(code[0]) % 256)
+            signal.signal(signal.SIGINT, lambda *_, worker=int(pid): os.kill(worker, signal.SIGINT))
         sys.exit(1)

@@ -24,6 +24,7 @@ class ForgedProcess(Process):
         state: Path | None,
         output: Path | None = None,
         imported: bool = True,
+        finalize: bool = False,
     ) -> None:
         self._forge = forge()
         self._folder = tempfile.TemporaryDirectory(prefix="physai-test-node-")
@@ -32,7 +33,9 @@ class ForgedProcess(Process):
         self._last: list[str] | None = None
         own = {"ROS_DOMAIN_ID": str(domain), "XDG_STATE_HOME": str(state or self._folder.name)}
         log = os.open(output or self._log, os.O_WRONLY | os.O_APPEND)
-        self._pid = self._forge.fork(module, list(map(str, arguments)), Path.cwd(), os.environ | own, log, imported)
+        self._pid = self._forge.fork(
+            module, list(map(str, arguments)), Path.cwd(), os.environ | own, log, imported, finalize
+        )
         os.close(log)
 
     @property
@@ -68,7 +71,13 @@ class ForgedProcess(Process):
 
 
 def forged(
-    module: str, domain: int, *args: str, state: Path | None = None, output: Path | None = None, **parameters: Any
+    module: str,
+    domain: int,
+    *args: str,
+    state: Path | None = None,
+    output: Path | None = None,
+    finalize: bool = False,
+    **parameters: Any,
 ) -> ForgedProcess:
     """Start a node: ``forged("inference_node", domain, policy_path=path)``.
 
@@ -78,7 +87,8 @@ def forged(
         args: Behind --ros-args.
         state: Where it keeps what it remembers; None for nowhere else.
         output: Where its output goes, such as a terminal; None for where it is read.
+        finalize: Whether it ends as slowly as elsewhere (:meth:`tests.forge.Forge.fork`).
         parameters: By name.
     """
     name = module if "." in module else f"physai.ros.{module}"
-    return ForgedProcess(name, node_command(module, *args, **parameters)[3:], domain, state, output)
+    return ForgedProcess(name, node_command(module, *args, **parameters)[3:], domain, state, output, finalize=finalize)

@@ -128,6 +128,7 @@ def closed_loop(
     module: str = "inference_node",
     state: Path | None = None,
     output: Path | None = None,
+    finalize: bool = False,
     **parameters: Any,
 ) -> Iterator[Loop]:
     """Run the inference node with an arm, in a domain of its own or in that of a peer; see :func:`forged`."""
@@ -136,6 +137,6 @@ def closed_loop(
             peer = Peer(stack.enter_context(free_domain()))
             stack.callback(peer.close)
         parameters = {"policy_path": policy_path, "autostart": True, **parameters}
-        node = forged(module, peer.domain, *args, state=state, output=output, **parameters)
+        node = forged(module, peer.domain, *args, state=state, output=output, finalize=finalize, **parameters)
         stack.callback(node.end)
         yield Loop(peer, node, profile, rate)

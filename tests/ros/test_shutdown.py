@@ -79,7 +79,7 @@ def test_a_node_that_never_had_a_say_ends_without_a_word(policy_path):
 @pytest.mark.slow
 @pytest.mark.fault("Ctrl-C, Ctrl-Z, or any number of signals")
 def test_a_storm_of_signals_ends_it_as_one_does(policy_path):
-    with closed_loop(policy_path, goal=GOAL) as loop:
+    with closed_loop(policy_path, goal=GOAL, finalize=True) as loop:
         loop.peer.moved(after=time.monotonic())
         while loop.node.poll() is None:
             for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1, signal.SIGTSTP):

@@ -79,6 +79,6 @@ def test_a_bad_range_is_named_in_one_line(text, reason):
 
 def test_values_are_overrides_that_the_command_line_takes():
     found = space.make_space({"policy.actor.hidden_sizes": "choice([64,64],[128])", "export.formats": "choice([])"})
-    config = composed(*space.overrides(space.samples(found)[1]))
+    config = compose("train", space.overrides(space.samples(found)[1]))
     assert config.policy.actor.hidden_sizes == [128]
     assert config.export.formats == []

@@ -54,9 +54,9 @@ def small_config(*overrides: str) -> TrainConfig:
     return validate(TrainConfig, composed(*SMALL, *overrides))
 
 
-def command(module: str, *arguments: str, cwd: Path) -> Forked:
+def command(module: str, *arguments: str, cwd: Path, finalize: bool = False) -> Forked:
     """Start a physai command as a user would, in a process and a session of its own."""
-    return Forked(f"physai.{module}", arguments, cwd, os.environ | {"COLUMNS": "200"})
+    return Forked(f"physai.{module}", arguments, cwd, os.environ | {"COLUMNS": "200"}, finalize)
 
 
 def metrics(run: Path) -> list[dict[str, str]]:

@@ -104,7 +104,7 @@ def test_a_run_goes_on_from_a_killed_worker_a_signal_to_all_processes_and_a_kill
     ("late", "number", "code"), [(0.0, signal.SIGINT, 130), (0.1, signal.SIGTERM, 143), (0.4, signal.SIGINT, 130)]
 )
 def test_a_signal_while_the_processes_start_ends_them_all(tmp_path, late, number, code):
-    process = command("train", *SIZES, "hydra.run.dir=run", cwd=tmp_path)
+    process = command("train", *SIZES, "hydra.run.dir=run", cwd=tmp_path, finalize=True)
     deadline = time.monotonic() + 60
     while not (everybody := descendants(process.pid)) and time.monotonic() < deadline:
         time.sleep(0.001)
