@@ -90,7 +90,7 @@ def test_what_happens_to_the_page_changes_nothing_on_a_robot(start, peer, robot)
     assert not stops
 
 
-@pytest.mark.slow
+@pytest.mark.realtime  # who has not stopped in time is asked, too
 def test_robots_come_and_go_and_come_back(start, peer, policy_path, robot):
     from physai.ros.live.robots import Ask, Robots
 
