@@ -27,11 +27,13 @@ from typing import Any, NoReturn
 from physai.processes import die_with
 
 # What workers of pytest, commands and nodes of ROS import, sooner or later; most of them run for less time than that.
-IMPORTED = [
+IMPORTED = (
     *("physai.training.run", "physai.cli", "physai.algorithms", "physai.collectors", "physai.physics.pybullet"),
     *("physai.plots.curriculum", "physai.plots.runs", "physai.web.scene", "scipy.stats", "torch.utils.tensorboard"),
-]
-NODES = ("inference_node", "virtual_robot", "record", "command_watchdog", "excite")
+)
+NODES = tuple(
+    f"physai.ros.{node}" for node in ("inference_node", "virtual_robot", "record", "command_watchdog", "excite")
+)
 LARGEST = 1 << 20  # bytes of an order
 
 
@@ -178,9 +180,7 @@ def _exit(code: int) -> NoReturn:
 
 def _import() -> None:
     gc.disable()
-    if importlib.util.find_spec("rclpy"):
-        IMPORTED.extend(f"physai.ros.{node}" for node in NODES)
-    for module in IMPORTED:
+    for module in (*IMPORTED, *(NODES if importlib.util.find_spec("rclpy") else ())):
         importlib.import_module(module)
     gc.freeze()  # no process looks for garbage in what is imported
     gc.enable()

@@ -94,8 +94,8 @@ def test_what_happens_to_the_page_changes_nothing_on_a_robot(start, peer, robot)
 def test_robots_come_and_go_and_come_back(start, peer, policy_path, robot):
     from physai.ros.live.robots import Ask, Robots
 
-    # The first words of a process take ROS 0.2 s, in which it looks through all that is imported; a dashboard has
-    # spoken before.
+    # The first words of a process take ROS a tenth of a second, in which it looks through all that is imported, and
+    # nothing is heard. A dashboard has spoken before.
     peer.node.get_logger().info("looking for robots")
     robots = Robots(peer.node, True)
     peer.node.create_timer(0.1, robots.look)
