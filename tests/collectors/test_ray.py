@@ -109,6 +109,7 @@ def working(head):
 
 def test_a_cluster_that_is_there_is_joined_and_left_as_it_was(cluster, tmp_path):
     address, head = cluster
+    assert all_gone(working(head))  # Ray ends those of the test before a second after it has left
     joining = ["collector=ray", f"collector.ray_init.address={address}", "collector.num_envs=16"]
     process = command("train", *TINY, *joining, "hydra.run.dir=run", cwd=tmp_path)
     workers = set()
