@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import trimesh
@@ -16,7 +15,7 @@ from physai.robots.urdf import load, parse, transform
 Color = tuple[int, int, int, int]
 
 GREY: Color = (160, 165, 172, 255)  # of what has no colour
-_METALLIC = 0.1  # from 0, as plastic, to 1
+METALLIC = 0.1  # of what nobody calls metal: from 0, as plastic, to 1
 
 
 def visual_bodies(urdf: Path, base: str, joints: Sequence[str]) -> list[list[trimesh.Trimesh]]:
@@ -70,8 +69,6 @@ def _meshes(path: Path, link: str, shape: etree._Element, color: Color | None) -
             mesh.apply_scale(scale)
             if not _has_color(mesh):
                 mesh.visual = plain(color)
-            elif isinstance(mesh.visual, trimesh.visual.TextureVisuals):
-                mesh.visual.material = _not_metal(mesh.visual.material)
             yield mesh
         return
     if element.tag == "box":
@@ -104,18 +101,9 @@ def _has_color(mesh: trimesh.Trimesh) -> bool:
     return visual is not None and visual.defined and visual.kind in ("texture", "vertex", "face")
 
 
-def _not_metal(material: Any) -> Any:
-    """Return a material as one of glTF, where what says nothing of metal, as in COLLADA, would be all metal."""
-    if not isinstance(material, trimesh.visual.material.PBRMaterial):
-        material = material.to_pbr()
-    if material.metallicFactor is None:
-        material.metallicFactor = _METALLIC
-    return material
-
-
 def plain(color: Color | None) -> trimesh.visual.TextureVisuals:
     """Return the look of one colour, grey where there is none."""
     material = trimesh.visual.material.PBRMaterial(
-        baseColorFactor=color or GREY, metallicFactor=_METALLIC, roughnessFactor=0.6
+        baseColorFactor=color or GREY, metallicFactor=METALLIC, roughnessFactor=0.6
     )
     return trimesh.visual.TextureVisuals(material=material)

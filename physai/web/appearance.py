@@ -4,6 +4,7 @@ import hashlib
 from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -14,7 +15,7 @@ from physai.config import validate
 from physai.deploy import Metadata
 from physai.errors import UserError
 from physai.robots import RobotConfig, RobotSpec, kinematics_of
-from physai.robots.visuals import plain, visual_bodies
+from physai.robots.visuals import METALLIC, plain, visual_bodies
 
 _ORANGE = (242, 115, 31, 255)  # of what stands in for the robot's own shapes
 _STICK = 0.03  # its radius, as a share of the robot's reach
@@ -143,6 +144,18 @@ def _sticks(kinematics: Kinematics) -> list[list[trimesh.Trimesh]]:
 def _gltf(meshes: list[trimesh.Trimesh]) -> bytes | None:
     if not meshes:
         return None
-    exported = trimesh.Scene(meshes).export(file_type="glb")
+    exported = trimesh.Scene(meshes).export(file_type="glb", tree_postprocessor=_not_metal)
     assert isinstance(exported, bytes)
     return exported
+
+
+def _not_metal(tree: dict[str, Any]) -> None:
+    """What a file does not call metal, as COLLADA, OBJ and PLY do not, is none; in glTF it would be all metal."""
+    materials = tree.setdefault("materials", [])
+    for mesh in tree["meshes"]:
+        for part in mesh["primitives"]:
+            if "material" not in part:
+                part["material"] = len(materials)
+                materials.append({})
+    for material in materials:
+        material.setdefault("pbrMetallicRoughness", {}).setdefault("metallicFactor", METALLIC)

@@ -2,6 +2,8 @@
 
 import asyncio
 import io
+import json
+import struct
 from types import SimpleNamespace
 
 import numpy as np
@@ -125,3 +127,30 @@ def test_no_client_can_have_the_page_shown_to_the_internet():
     with serve("127.0.0.1", 0, "page", 1.0) as server:
         assert server.request_share_url() is None
         assert server._share_tunnel is None
+
+
+@pytest.mark.parametrize("ending", ["obj", "ply", "glb"])
+def test_only_what_a_mesh_calls_metal_is_metal_and_it_keeps_its_colour(tmp_path, env_config, ending):
+    """A page has no surroundings; metal, which reflects them, is black."""
+    mesh = trimesh.creation.box(extents=(0.1, 0.1, 0.1))
+    red = (200, 30, 30, 255)
+    if ending == "ply":
+        mesh.visual = trimesh.visual.ColorVisuals(mesh, vertex_colors=[red] * 8)
+    elif ending == "obj":
+        paint = trimesh.visual.material.SimpleMaterial(diffuse=red)
+        mesh.visual = trimesh.visual.TextureVisuals(np.zeros((8, 2)), paint)
+    else:
+        steel = trimesh.visual.material.PBRMaterial(baseColorFactor=red, metallicFactor=0.9)
+        mesh.visual = trimesh.visual.TextureVisuals(material=steel)
+    mesh.export(tmp_path / f"hand.{ending}")
+    read = trimesh.load_scene(tmp_path / f"hand.{ending}").dump()
+    spec = RobotSpec.from_config(env_config("reacher").robot)
+    look = Appearance.of_shapes(kinematics_of(spec), [read, [], []])
+    tree = json.loads(look.bodies[0][20 : 20 + struct.unpack("<I", look.bodies[0][12:16])[0]])
+    (part,) = tree["meshes"][0]["primitives"]
+    material = tree["materials"][part["material"]]["pbrMetallicRoughness"]
+    assert material["metallicFactor"] == (0.9 if ending == "glb" else 0.1)
+    if ending == "ply":
+        assert "COLOR_0" in part["attributes"]
+    else:
+        assert material["baseColorFactor"][:3] == pytest.approx([c / 255 for c in red[:3]], abs=0.01)
