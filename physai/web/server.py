@@ -62,7 +62,7 @@ def serve(
     with contextlib.redirect_stdout(io.StringIO()), keeper:  # it prints its address in a frame
         server = Server(host=host, port=port, label=label, verbose=False)
     server.gui.configure_theme(control_layout="fixed", show_logo=False, show_share_button=False)
-    # Surroundings to reflect take a browser without a GPU 20 s of processor time, which nodes beside it may need.
+    # Surroundings to reflect take a browser without a GPU 10 s of processor time, which nodes beside it may need.
     server.scene.configure_environment_map(None)
     server.scene.add_light_hemisphere("/sky", ground_color=(190, 190, 200), intensity=2.5)
     size, place = 4 * reach, (0.0, 0.0, floor)
