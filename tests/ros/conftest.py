@@ -2,6 +2,7 @@
 
 import gc
 import os
+import textwrap
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -60,9 +61,9 @@ def pytest_runtest_protocol(item: pytest.Item, nextitem: pytest.Item | None) -> 
                 break
             item.config.stash[EXCUSES] -= 1
         crash = next(getattr(report.longrepr, "reprcrash", report.longrepr) for report in reports if report.failed)
-        reason = str(getattr(crash, "message", crash)).splitlines()[0]
+        reason = textwrap.indent(str(getattr(crash, "message", crash)), "    ")
         excuse = f"a stall of {stall:.2f} s" if stall else "NO stall was seen"
-        item.config.stash[REPEATED].append(f"{item.nodeid}: {reason}, and {excuse}")
+        item.config.stash[REPEATED].append(f"{item.nodeid}: {excuse}\n{reason}")
         item._initrequest()  # fixtures of its own
     for report in reports:
         item.ihook.pytest_runtest_logreport(report=report)
