@@ -85,26 +85,29 @@ def _solve(
     """Pivot until each joint stands on a step of its staircase that fits the others'.
 
     The less velocity, the more impulse: a staircase with five steps for each joint. On even ones the velocity is
-    given: -2 by the upper limit, 0 by the motor's target, 2 by the lower limit. On odd ones the impulse is: all that
-    the motor has, backward on -1 and forward on 1. All joints that do not fit take a step at once, which needs few
+    given: 0 by the upper limit, 2 by the motor's target, 4 by the lower limit. On odd ones the impulse is: all that
+    the motor has, backward on 1 and forward on 3. All joints that do not fit take a step at once, which needs few
     rounds; after some, one at a time, which cannot go round in circles (Júdice and Pires, 1994, on pivoting in blocks).
     """
-    endless = np.full_like(target, np.inf)
-    speeds = np.stack([upper, np.clip(target, lower, upper), lower])
+    middle, ends = np.clip(target, lower, upper), np.full_like(target, np.inf)
     # On a target that a limit has moved, that limit helps the motor without end.
-    least = np.stack([-endless, np.where(target > upper, -endless, -limit), limit])
-    most = np.stack([-limit, np.where(target < lower, endless, limit), endless])
-    step = np.where(impulse > most[1], 1, np.where(impulse < least[1], -1, 0))
+    least, most = np.where(target > upper, -ends, -limit), np.where(target < lower, ends, limit)
+    # Of each step: what is given, and the bounds of what is not: of the impulse, or of the velocity, negated.
+    known = np.stack([upper - free, -limit, middle - free, limit, lower - free])
+    largest = np.stack([-limit, -middle, most, -lower, ends])
+    smallest = np.stack([-ends, -upper, least, -middle, limit])
+    step = np.where(impulse > most, 3, np.where(impulse < least, 1, 2))
     velocity, rows = target.copy(), np.arange(len(target))
+    eye, each = np.eye(target.shape[1]), np.arange(target.size).reshape(target.shape)
     for round_ in range(_ROUNDS):
-        given = step % 2 == 0
-        known = np.where(given, _on(speeds, step) - free, step * limit)
-        change = np.linalg.solve(np.where(given[:, :, None], np.eye(step.shape[1]), mass), known[:, :, None])[:, :, 0]
+        given, at = step % 2 == 0, step * step.size + each
+        matrix = np.where(given[:, :, None], eye, mass)
+        change = np.linalg.solve(matrix, known.take(at)[:, :, None])[:, :, 0]
         impulse, speed = _product(mass, change), free + change
         velocity[rows] = speed
-        slack = _EXACT * (1.0 + np.abs(impulse))
-        up = np.where(given, impulse > _on(most, step) + slack, speed < _on(speeds, step + 1) - _EXACT)
-        down = np.where(given, impulse < _on(least, step) - slack, speed > _on(speeds, step - 1) + _EXACT)
+        slack = np.where(given, _EXACT * (1.0 + np.abs(impulse)), _EXACT)
+        found = np.where(given, impulse, -speed)
+        up, down = found > largest.take(at) + slack, found < smallest.take(at) - slack
         if round_ >= _TOGETHER:
             last = np.cumsum((up | down)[:, ::-1], axis=1)[:, ::-1] == 1
             up, down = up & last, down & last
@@ -113,14 +116,10 @@ def _solve(
         if not open_.any():
             break
         if not open_.all():
-            rows, step, mass, free, limit = (array[open_] for array in (rows, step, mass, free, limit))
-            speeds, least, most = (array[:, open_] for array in (speeds, least, most))
+            rows, step, mass, free = (array[open_] for array in (rows, step, mass, free))
+            known, largest, smallest = (array[:, open_] for array in (known, largest, smallest))
+            each = each[: len(rows)]
     return velocity
-
-
-def _on(values: np.ndarray, step: np.ndarray) -> np.ndarray:
-    """Values [3, N, n] of the even steps -2, 0 and 2, at the one that each joint is on."""
-    return np.choose(step // 2 + 1, values, mode="clip")
 
 
 def _product(matrix: np.ndarray, vector: np.ndarray) -> np.ndarray:

@@ -222,7 +222,8 @@ class _Impulse:
             free = np.clip(velocity + dt * self._acceleration, -FASTEST, FASTEST)
             target = free + self._gain * (command - free)
             low, high = limit_velocity(self._lower - position, dt), -limit_velocity(position - self._upper, dt)
-            velocity, impulse = motor_velocity(self._mass[:, self._places], free, target, largest, low, high)
+            mass = self._mass.take(self._places, axis=1)
+            velocity, impulse = motor_velocity(mass, free, target, largest, low, high)
             velocity = np.clip(velocity, -FASTEST, FASTEST)
             position += dt * velocity
             self._position[:], self._velocity[:] = position, velocity
