@@ -19,6 +19,8 @@ from physai.deploy.policy import Driver
 from physai.errors import UserError
 
 _ROUNDING = 1e-5  # rad; of positions of single precision
+# s, in which a robot keeps a stance in the midst of its walk and can still walk on. To stand up anew would topple it.
+_PAUSE = 0.5
 
 
 class LeggedController(Controller):
@@ -28,9 +30,10 @@ class LeggedController(Controller):
     faster one than the policy was trained for counts as the fastest. A robot that begins to walk first stands up, in
     ``rise_time`` s.
 
-    What stands on legs must not simply stop. In a HOLD it keeps the positions that it was told last. In a FAULT and an
-    emergency stop each joint is told to be where it is: then only its damping is left, and the robot sinks down. To
-    lean by more than ``max_tilt`` is a FAULT.
+    What stands on legs must not simply stop. In a HOLD it keeps the positions that it was told last; after half a
+    second or less it walks on from there, after more it stands up first. In a FAULT and an emergency stop each joint is
+    told to be where it is: then only its damping is left, and the robot sinks down. To lean by more than ``max_tilt``
+    is a FAULT.
 
     Args:
         policy: From :func:`physai.deploy.load_policy`, of a robot whose base floats.
@@ -55,6 +58,7 @@ class LeggedController(Controller):
         self._commanded = -math.inf  # when a good goal came
         self._turn = _checked_turn(metadata)
         self._walked = self._risen = self._rise = 0.0
+        self._drove = -math.inf  # when the policy last did
         self._start = metadata.home
         self._nothing = np.zeros(len(metadata.joints))
         self._last_action = self._nothing
@@ -144,9 +148,10 @@ class LeggedController(Controller):
 
     def _drive(self, elapsed: float, reasons: list[str]) -> tuple[np.ndarray | None, np.ndarray]:
         """Ask the policy once in its period; return the positions to go to, or None to stand, and the new memory."""
-        robot, stance = self._robot, self._interface
-        before = stance.target
-        if before is None or not stance.drives:
+        assert self._now is not None
+        robot, before = self._robot, self._interface.target
+        paused, self._drove = self._now - self._drove, self._now
+        if before is None or not 0.0 <= paused <= _PAUSE:
             self._begin(before := robot.position.copy() if before is None else before)
         else:
             self._step += elapsed

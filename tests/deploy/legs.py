@@ -61,6 +61,12 @@ class Legs:
             self.told = command.value
         return command
 
+    def pass_by(self, count):
+        """Periods in which the controller is not asked."""
+        for _ in range(count):
+            self.physics.step(self.told[None])
+            self.now += PERIOD
+
     def ticks(self, count, **arguments):
         return [self.tick(**arguments) for _ in range(count)]
 

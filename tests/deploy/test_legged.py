@@ -87,6 +87,35 @@ def test_in_a_hold_it_keeps_what_it_was_told_and_goes_on_when_it_is_heard_of_aga
     assert [command.state for command in legs.ticks(8, goal=AHEAD)][-3:] == [State.ACTIVE] * 3
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("what", ["late", "slow", "silent", "interlock"])
+def test_after_a_moment_in_which_it_kept_its_stance_it_walks_on_and_does_not_fall(walking_policy, what):
+    """As many legs are in the air at one time as at another: each part of the gait is tried."""
+    for phase in range(0, 25, 2):
+        legs = Legs(walking_policy)
+        legs.walk(80 + phase)
+        if what == "late":
+            legs.pass_by(19)
+        elif what == "slow":
+            legs.policy.trouble = "slow"
+            assert "ms" in legs.tick(goal=AHEAD).reasons[0]
+            legs.policy.trouble = None
+        else:
+            legs.ticks(9, goal=AHEAD, **({"state": None} if what == "silent" else {"interlocks": ["not enabled"]}))
+        commands = legs.ticks(100, goal=AHEAD)
+        assert not any("it stands up" in command.reasons for command in commands)
+        assert commands[-1].state is State.ACTIVE
+        assert legs.true.velocity[0] > 0.2
+        legs.physics.close()
+
+
+def test_after_a_longer_one_it_stands_up_first(legs):
+    legs.walk()
+    legs.ticks(100)  # it stands
+    legs.ticks(30, goal=AHEAD, interlocks=["not enabled"])
+    assert all("it stands up" in command.reasons for command in legs.ticks(45, goal=AHEAD))
+
+
 @pytest.mark.fault("the base leans by more than `max_tilt` (0.8 rad)")
 def test_to_lean_too_far_is_a_fault_in_which_the_joints_only_damp(legs):
     legs.walk()

@@ -54,7 +54,6 @@ def speed(peer):
 
 def test_it_walks_as_it_is_told_stands_without_a_command_and_sinks_in_an_emergency_stop(walker):
     start = place(walker)
-    # A late tick, as there is where others work, too, makes it stand up anew.
     walker.walk(lambda: np.linalg.norm((place(walker) - start)[:2]) > 1.0, 90.0)
     assert place(walker)[2] > 0.2
 
