@@ -68,7 +68,7 @@ def test_the_discovery_tests_pick_up_what_is_added(project):
 @pytest.mark.slow
 def test_all_of_it_trains_together(project):
     tiny = ("total_frames=2048", "collector.num_envs=64", "evaluation.goals=8", "evaluation.episodes=8")
-    tiny += ("evaluation.in_a_row=0", "env.task.max_steps=20", "export.formats=[torchscript]")
+    tiny += ("evaluation.in_a_row=0", "env.task.max_steps=30", "export.formats=[torchscript]")
     choice = ("algo=reuse", "env=joint_reach", "robot@env.robot=long_arm")
     result = run(project, "-m", "physai.train", *choice, *tiny, "hydra.run.dir=run")
     assert result.returncode == 0, result.stdout + result.stderr

@@ -9,7 +9,7 @@ import numpy as np
 
 from physai.artifact.gate import GateError, drive
 from physai.artifact.module import DeployablePolicy
-from physai.compose import compose, cores
+from physai.compose import compose
 from physai.config import not_installed
 from physai.envs.simulation import EnvConfig, Simulation
 from physai.errors import UserError
@@ -103,8 +103,7 @@ def ask(content: bytes, policy: DeployablePolicy, trained: TrainedPolicy, episod
     found = differences(config, physics) if config.robot.floating is None else []  # one that floats turns itself, too
     rotor = _ROTOR if physics.get("motor") == "servo" and config.robot.servo is None else 0.0
     robot = config.robot.model_copy(update={"armature": [rotor]})
-    threads = {"threads": cores()} if "threads" in physics else {}  # no result depends on them
-    other = config.model_copy(update={"physics": physics | threads, "robot": robot})
+    other = config.model_copy(update={"physics": physics, "robot": robot})
     _, env = trained.deploy(min(episodes, MAX_ROBOTS), seed, other)
     with closing(env):
         driven = drive(content, policy, env, episodes, seed)

@@ -177,10 +177,9 @@ class StanceInterface(VelocityInterface):
         return velocity, None
 
     def stand(self, position: np.ndarray) -> np.ndarray | None:
-        """See :class:`VelocityInterface`."""
-        self.drives = False
+        """See :class:`VelocityInterface`; it keeps what the policy wanted."""
         if self.target is None and np.isfinite(position).all():
-            self.target = position.copy()
+            self.target, self.drives = position.copy(), False
         return self.target
 
     def release(self) -> None:

@@ -58,7 +58,7 @@ class LeggedController(Controller):
         self._commanded = -math.inf  # when a good goal came
         self._turn = _checked_turn(metadata)
         self._walked = self._risen = self._rise = 0.0
-        self._drove = -math.inf  # when the policy last did
+        self._drove = -math.inf  # when the policy last did; never, where that does not count any more
         self._start = metadata.home
         self._nothing = np.zeros(len(metadata.joints))
         self._last_action = self._nothing
@@ -91,7 +91,7 @@ class LeggedController(Controller):
 
     def forget_goal(self) -> bool:
         """Wait for a new command; return whether there was one."""
-        self._commanded = -math.inf
+        self._commanded = self._drove = -math.inf
         return super().forget_goal()
 
     def not_sent(self) -> None:
@@ -117,6 +117,8 @@ class LeggedController(Controller):
     def _hold(self, kind: str, reason: str) -> str:
         if kind in ("silent", "another source"):
             self._interface.release()
+        elif kind == "clock":
+            self._drove = -math.inf
         return super()._hold(kind, reason)
 
     def _sense(self, now: float, reasons: list[str]) -> None:
@@ -149,9 +151,9 @@ class LeggedController(Controller):
     def _drive(self, elapsed: float, reasons: list[str]) -> tuple[np.ndarray | None, np.ndarray]:
         """Ask the policy once in its period; return the positions to go to, or None to stand, and the new memory."""
         assert self._now is not None
-        robot, before = self._robot, self._interface.target
-        paused, self._drove = self._now - self._drove, self._now
-        if before is None or not 0.0 <= paused <= _PAUSE:
+        robot, stance = self._robot, self._interface
+        before, walks = stance.target, stance.drives and 0.0 <= self._now - self._drove <= _PAUSE
+        if before is None or not walks:
             self._begin(before := robot.position.copy() if before is None else before)
         else:
             self._step += elapsed
@@ -212,6 +214,8 @@ class LeggedController(Controller):
     def _send(self, velocity: np.ndarray | None, elapsed: float, reasons: list[str]) -> np.ndarray | None:
         if velocity is None and self._latched is not None:
             return self._interface.give_way(self._robot.position)
+        if velocity is not None:
+            self._drove = self._now or 0.0
         return super()._send(velocity, elapsed, reasons)
 
 

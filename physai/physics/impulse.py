@@ -89,13 +89,14 @@ def _solve(
     the motor has, backward on 1 and forward on 3. All joints that do not fit take a step at once, which needs few
     rounds; after some, one at a time, which cannot go round in circles (Júdice and Pires, 1994, on pivoting in blocks).
     """
-    middle, ends = np.clip(target, lower, upper), np.full_like(target, np.inf)
+    middle, endless = np.clip(target, lower, upper), np.full_like(target, np.inf)
     # On a target that a limit has moved, that limit helps the motor without end.
-    least, most = np.where(target > upper, -ends, -limit), np.where(target < lower, ends, limit)
-    # Of each step: what is given, and the bounds of what is not: of the impulse, or of the velocity, negated.
+    least, most = np.where(target > upper, -endless, -limit), np.where(target < lower, endless, limit)
+    # Of each step: the change of velocity or the impulse that is given, and the bounds of the other one; those of a
+    # velocity are negated, so that all are passed upward where there must be more impulse.
     known = np.stack([upper - free, -limit, middle - free, limit, lower - free])
-    largest = np.stack([-limit, -middle, most, -lower, ends])
-    smallest = np.stack([-ends, -upper, least, -middle, limit])
+    largest = np.stack([-limit, -middle, most, -lower, endless])
+    smallest = np.stack([-endless, -upper, least, -middle, limit])
     step = np.where(impulse > most, 3, np.where(impulse < least, 1, 2))
     velocity, rows = target.copy(), np.arange(len(target))
     eye, each = np.eye(target.shape[1]), np.arange(target.size).reshape(target.shape)
@@ -117,7 +118,7 @@ def _solve(
             break
         if not open_.all():
             rows, step, mass, free = (array[open_] for array in (rows, step, mass, free))
-            known, largest, smallest = (array[:, open_] for array in (known, largest, smallest))
+            known, largest, smallest = (array.compress(open_, axis=1) for array in (known, largest, smallest))
             each = each[: len(rows)]
     return velocity
 

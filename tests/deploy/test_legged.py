@@ -90,7 +90,7 @@ def test_in_a_hold_it_keeps_what_it_was_told_and_goes_on_when_it_is_heard_of_aga
 @pytest.mark.slow
 @pytest.mark.parametrize("what", ["late", "slow", "silent", "interlock"])
 def test_after_a_moment_in_which_it_kept_its_stance_it_walks_on_and_does_not_fall(walking_policy, what):
-    """As many legs are in the air at one time as at another: each part of the gait is tried."""
+    """It is interrupted in each part of its gait."""
     for phase in range(0, 25, 2):
         legs = Legs(walking_policy)
         legs.walk(80 + phase)
@@ -109,11 +109,55 @@ def test_after_a_moment_in_which_it_kept_its_stance_it_walks_on_and_does_not_fal
         legs.physics.close()
 
 
-def test_after_a_longer_one_it_stands_up_first(legs):
+def test_after_a_longer_pause_it_stands_up_first(legs):
     legs.walk()
     legs.ticks(100)  # it stands
     legs.ticks(30, goal=AHEAD, interlocks=["not enabled"])
     assert all("it stands up" in command.reasons for command in legs.ticks(45, goal=AHEAD))
+
+
+def stopped(legs):
+    legs.controller.emergency_stop()
+    legs.ticks(3)
+    legs.controller.reset()
+
+
+def stopped_and_reset_at_once(legs):
+    legs.controller.emergency_stop()
+    legs.controller.reset()
+
+
+def heard_of_by_another(legs):
+    for source in ("one", "another"):
+        legs.tick(goal=AHEAD, state=legs.state(stamp=legs.now + PERIOD, source=source))
+
+
+def not_sent_and_interlocked(legs):
+    legs.controller.not_sent()
+    legs.ticks(2, interlocks=["not enabled"])
+
+
+def taken_over(legs):
+    legs.controller.forget_goal()
+    legs.ticks(2, interlocks=["another publisher"])
+
+
+def with_another_clock(legs):
+    legs.now -= 10.0
+    legs.ticks(2)
+
+
+@pytest.mark.parametrize(
+    "after",
+    [stopped, stopped_and_reset_at_once, heard_of_by_another, not_sent_and_interlocked, taken_over, with_another_clock],
+)
+def test_where_its_stance_is_that_of_its_walk_no_more_it_stands_up_first(legs, after):
+    """However short the pause was."""
+    legs.walk()
+    after(legs)
+    commands = [command for command in legs.ticks(14, goal=AHEAD) if command.state is State.ACTIVE]
+    assert len(commands) > 5
+    assert all("it stands up" in command.reasons for command in commands)
 
 
 @pytest.mark.fault("the base leans by more than `max_tilt` (0.8 rad)")

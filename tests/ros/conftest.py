@@ -84,8 +84,8 @@ def pytest_testnodedown(node: Any, error: Any) -> None:
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:
     if config.stash[REPEATED]:
         terminalreporter.section("repeated, for they failed at first")
-        for line in config.stash[REPEATED]:
-            terminalreporter.line(line)
+        for repeated in config.stash[REPEATED]:
+            terminalreporter.line(repeated)
 
 
 @pytest.fixture(autouse=True)
