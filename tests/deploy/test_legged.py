@@ -116,6 +116,16 @@ def test_after_a_longer_pause_it_stands_up_first(legs):
     assert all("it stands up" in command.reasons for command in legs.ticks(45, goal=AHEAD))
 
 
+def test_a_policy_that_fails_on_and_on_does_not_make_a_pause_shorter(legs):
+    legs.controller.configure(ControllerConfig(policy_failures=100))
+    legs.walk()
+    legs.ticks(100)  # it stands
+    legs.policy.trouble = "slow"
+    legs.ticks(30)
+    legs.policy.trouble = None
+    assert all("it stands up" in command.reasons for command in legs.ticks(45, goal=AHEAD))
+
+
 def stopped(legs):
     legs.controller.emergency_stop()
     legs.ticks(3)
@@ -142,14 +152,21 @@ def taken_over(legs):
     legs.ticks(2, interlocks=["another publisher"])
 
 
-def with_another_clock(legs):
-    legs.now -= 10.0
-    legs.ticks(2)
+def with_a_clock_set_back(legs):
+    legs.now -= 0.3
+    legs.ticks(20, interlocks=["not enabled"])  # which seem to be 0.1 s
 
 
 @pytest.mark.parametrize(
     "after",
-    [stopped, stopped_and_reset_at_once, heard_of_by_another, not_sent_and_interlocked, taken_over, with_another_clock],
+    [
+        stopped,
+        stopped_and_reset_at_once,
+        heard_of_by_another,
+        not_sent_and_interlocked,
+        taken_over,
+        with_a_clock_set_back,
+    ],
 )
 def test_where_its_stance_is_that_of_its_walk_no_more_it_stands_up_first(legs, after):
     """However short the pause was."""
