@@ -225,7 +225,7 @@ class InferenceNode(StoppableNode[InferenceConfig]):
         goal, self._goal = self._goal, None
         felt = {} if self._imu is None else {"imu": self._imu.take()}
         command = self._controller.update(now, self._robot.take(), goal, interlocks, **felt)
-        if not self._publish(command) or self._arrived < now:
+        if not self._publish(command) or self._commands.lost:
             self._controller.not_sent()
         self._forget_old_goal(now)
         before, self._command = self._command, command

@@ -1,5 +1,6 @@
 """A robot on legs over ROS 2: it walks past corners, stands without commands, and sinks down in an emergency."""
 
+import signal
 import time
 
 import numpy as np
@@ -19,14 +20,15 @@ COMMANDS = f"/{controller_topic(Quantity.JOINT_POSITION)}"
 
 @pytest.fixture
 def walker(start, peer, walking_run):
-    """A virtual A1 under its node, and what is heard of it; it walks ahead when it is told to."""
+    """A virtual A1 under its node and a watchdog, and what is heard of it; it walks ahead when it is told to."""
     peer.told, peer.odometry, peer.imu = [], [], []
     peer.listen(Float64MultiArray, COMMANDS, peer.told, 1000, lambda message: np.array(message.data))
     peer.listen(Odometry, "/odom", peer.odometry, 10)
     peer.listen(Imu, "/imu", peer.imu, 10)
     robot = start("virtual_robot", env="a1_walk", physics="mujoco", randomization="default")
     robot.says("takes joint_position of ['FR_hip_joint'", 60.0)
-    start("inference_node", policy_path=walking_run / "policy.pt", autostart=True)
+    peer.watchdog = start("command_watchdog", command="joint_position", joints=12)
+    start("inference_node", policy_path=walking_run / "policy.pt", autostart=True, watchdog="command_watchdog")
     peer.wait_state("waiting", timeout=60.0)
 
     def walk(until, seconds):
@@ -67,6 +69,24 @@ def test_it_walks_as_it_is_told_stands_without_a_command_and_sinks_in_an_emergen
     told, joints = walker.told[-1][1], np.array(walker.joint_states[-1][1].position)
     np.testing.assert_allclose(told, joints, atol=0.05)  # each is told to be where it is
     assert place(walker)[2] < 0.2
+
+
+@pytest.mark.fault("the watchdog is silent")
+def test_it_keeps_its_stance_while_the_watchdog_is_silent_and_walks_when_it_is_back(walker):
+    wait_for(lambda: "it stands" in walker.diagnostics[-1][1].status[0].message, 10.0, "a robot without a command")
+    walker.watchdog.signal(signal.SIGSTOP)
+    walker.wait_state("waiting")
+    since = time.monotonic()
+    time.sleep(2.0)
+    told = np.array([positions for at, positions in walker.told if at > since])
+    assert len(told) > 50
+    np.testing.assert_array_equal(told, told[:1].repeat(len(told), axis=0))
+    assert place(walker)[2] > 0.2
+
+    walker.watchdog.signal(signal.SIGCONT)
+    start = place(walker)
+    walker.walk(lambda: np.linalg.norm((place(walker) - start)[:2]) > 0.3, 60.0)
+    assert place(walker)[2] > 0.2
 
 
 def test_the_virtual_robot_tells_what_its_imu_feels_and_where_it_is(walker):

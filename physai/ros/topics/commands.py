@@ -70,6 +70,11 @@ class JointCommands:
         return None if self._publisher.get_subscription_count() else f"no controller listens to {self.topic}"
 
     @property
+    def lost(self) -> bool:
+        """Whether not even a command that stands still reaches a controller."""
+        return self.unheard is not None
+
+    @property
     def arrived(self) -> bool:
         """Whether all who are known to listen have the last command.
 

@@ -52,6 +52,11 @@ class WatchedCommands(JointCommands):
         self.silences += before and not self._answering
         return None if self._answering else f"the watchdog {self._name} does not answer, or waits for its ~/reset"
 
+    @property
+    def lost(self) -> bool:
+        """See :class:`JointCommands`; what stands still also goes past a watchdog that does not answer."""
+        return self._past.unheard is not None and (not self._answering or self.unheard is not None)
+
     def send(self, command: Sequence[float]) -> None:
         """Publish a command; while the watchdog does not answer, stop past it first."""
         if time.monotonic() - self._last > self.timeout:
