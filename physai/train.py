@@ -65,9 +65,10 @@ class Training:
     def __init__(self, keep: bool = False) -> None:
         self._keep = keep
         self._agent: Agent | None = None
+        self._checked: list[TrainConfig] = []
 
     def check(self, node: DictConfig) -> None:
-        """Build the parts; raises a UserError if one cannot be built."""
+        """Build the parts; raises a UserError if one cannot be built. In a sweep, what was built once is not again."""
         from physai.artifact.module import make_deployable, script
         from physai.artifact.transfer import other_engine
         from physai.training.agent import Agent
@@ -75,6 +76,11 @@ class Training:
         self.close()
         config = _config(node)
         _watching(node)
+        apart_from_seed = config.model_copy(update={"seed": 0})
+        if apart_from_seed in self._checked:
+            return
+        if any(config.collector == one.collector for one in self._checked):
+            config = config.model_copy(update={"collector": config.collector.smallest})
         self._agent = Agent.build(config)
         if config.export.formats:
             script(make_deployable(self._agent.policy(), self._agent.env))  # what does not script cannot be exported
@@ -82,6 +88,7 @@ class Training:
                 other_engine(config.env.physics)
         if not self._keep:
             self.close()
+            self._checked.append(apart_from_seed)
 
     def __reduce__(self) -> tuple[type, tuple[()]]:
         return Training, ()  # a job in another process builds its own
@@ -101,6 +108,7 @@ class Training:
             self._agent.close()
             self._agent = None
             gc.collect()  # its parts know each other, and the next config's are as many
+            gc.freeze()  # what is left was imported; to look at it again takes a quarter of a second for each config
 
 
 def _resume(run_dir: Path, given: list[str]) -> None:

@@ -8,6 +8,7 @@ import pytest
 
 from physai import train
 from physai.cli import command as cli
+from physai.collectors.single import RobotCollector
 from physai.errors import UserError
 from physai.training.agent import Agent
 from tests.composed import composed
@@ -76,6 +77,14 @@ def training(monkeypatch):
             agent.close()
 
 
+@pytest.fixture
+def built(monkeypatch):
+    """What is built, in order."""
+    built, build = [], Agent.build
+    monkeypatch.setattr(Agent, "build", lambda config: built.append(build(config)) or built[-1])
+    return built
+
+
 def test_what_was_checked_is_what_a_run_trains(training, tmp_path):
     command, trained = training(keep=True)
     node = composed(*SMALL)
@@ -87,11 +96,9 @@ def test_what_was_checked_is_what_a_run_trains(training, tmp_path):
 
 
 @pytest.mark.slow
-def test_the_jobs_of_a_sweep_build_their_own_and_its_check_keeps_no_robots(training, monkeypatch, tmp_path):
+def test_the_jobs_of_a_sweep_build_their_own_and_its_check_keeps_no_robots(training, built, tmp_path):
     command, trained = training(keep=False)
-    built, build = [], Agent.build
-    monkeypatch.setattr(Agent, "build", lambda config: built.append(build(config)) or built[-1])
-    nodes = [composed(*SMALL, f"seed={seed}") for seed in (0, 1)]
+    nodes = [composed(*SMALL, f"threads={threads}") for threads in (1, 2)]
     for node in nodes:
         command.check(node)
     assert [agent.env.simulation.physics._worlds for agent in built] == [[], []]
@@ -99,6 +106,19 @@ def test_the_jobs_of_a_sweep_build_their_own_and_its_check_keeps_no_robots(train
     for node in nodes:
         command.train(node, tmp_path)
     assert trained == [None, None]
+
+
+@pytest.mark.slow
+def test_a_sweep_s_check_builds_nothing_for_another_seed_and_starts_a_collector_once(training, built):
+    command, _ = training(keep=False)
+    for value in ("seed=0", "seed=1", "algo.optimizer.lr=1e-3", "policy=gru", "collector.processes=2"):
+        command.check(composed(*SMALL, "collector=async", value))
+    started = [not isinstance(agent.collector, RobotCollector) for agent in built]
+    assert started == [True, False, False, True]
+    with pytest.raises(UserError, match=r"seed"):
+        command.check(composed(*SMALL, "collector=async", "seed=-1"))
+    with pytest.raises(UserError, match=r"must be a multiple of collector\.processes \(3\)"):
+        command.check(composed(*SMALL, "collector=async", "collector.processes=3"))
 
 
 @pytest.mark.parametrize("error", [None, UserError("no such thing")])

@@ -180,7 +180,8 @@ def _check_all(
     jobs: Iterable[DictConfig]
     if sweep:
         fixed = [str(one.input_line) for one in parse(given) if not one.is_sweep_override()]
-        whole, jobs = compose(name, fixed, hydra=True), (compose(name, one, hydra=True) for one in _combinations(given))
+        combinations = _shown(list(_combinations(given)))
+        whole, jobs = compose(name, fixed, hydra=True), (compose(name, one, hydra=True) for one in combinations)
     else:
         jobs = [whole := compose(name, given, hydra=True)]
     try:
@@ -210,9 +211,23 @@ def _check_all(
     if not os.access(folder, os.W_OK):
         raise UserError(f"cannot write to the run folder {folder}")
     pinned = [f"{key}='{folder}'"]
-    if sweep and launcher.endswith(".LocalLauncher") and whole.hydra.sweeper.max_batch_size is None:
-        pinned.append(f"hydra.sweeper.max_batch_size={jobs_at_once(whole)}")  # submitit would start all jobs at once
+    if sweep and whole.hydra.sweeper.max_batch_size is None:
+        if launcher.endswith(".LocalLauncher"):  # submitit would start all jobs at once
+            pinned.append(f"hydra.sweeper.max_batch_size={jobs_at_once(whole)}")
+        elif launcher.endswith(".BasicLauncher"):  # Hydra would compose all jobs once more before it starts the first
+            pinned.append("hydra.sweeper.max_batch_size=1")
     return whole, pinned
+
+
+def _shown(combinations: list[list[str]]) -> Iterator[list[str]]:
+    """Show on a terminal how far the check of a sweep is."""
+    from rich.console import Console
+    from rich.progress import Progress
+
+    # By itself it would take a thread for that, while the check forks.
+    bar = Progress(console=Console(stderr=True), auto_refresh=False, transient=True, disable=not sys.stderr.isatty())
+    with bar:
+        yield from bar.track(combinations, description=f"checking {len(combinations)} jobs")
 
 
 def _combinations(given: list[str]) -> Iterable[list[str]]:

@@ -35,6 +35,11 @@ class CollectorConfig(Config):
         return self.processes == 1 and self.sync and self.ray_init is None
 
     @property
+    def smallest(self) -> "CollectorConfig":
+        """One robot in the learner's own process, for batches of the same size."""
+        return self.model_copy(update={"num_envs": 1, "processes": 1, "sync": True, "ray_init": None})
+
+    @property
     def envs_of_learner(self) -> int:
         """How many robots the learner's own process needs: all, or one that shows what others are like."""
         return self.num_envs if self.in_process else 1

@@ -10,12 +10,13 @@ from scipy.spatial.transform import Rotation
 from physai.collision import CollisionModel
 from physai.config import PositiveFloat
 from physai.errors import UserError
-from physai.robots import ForwardKinematics, RobotSpec
+from physai.robots import EndEffector, ForwardKinematics, RobotSpec
 from physai.signals import Quantity, Reachable
 
 _EXAMPLES = 256  # goals in the policy file
 _CLEARANCE = 0.01  # m, which the controller's collision guard keeps, too: nearer, a robot would be held back
 _TRIES = 64  # configurations drawn at a time at least
+_ROUNDING = 1e-4  # m, and more than that: how far apart are what computes with few digits and what does with many
 _HARDLY = 1e-3  # a share of configurations that lead there; with less, something is wrong
 
 
@@ -53,6 +54,7 @@ class ReachableGoals:
         self._lower, self._upper = middle - half, middle + half
         self._low, self._high = np.array(low), np.array(high)
         self._kinematics, self._quantity, self._surroundings = kinematics, quantity, surroundings
+        self._end_effector = EndEffector(kinematics)
         turns = [1.0] * (4 if quantity is Quantity.POSE else 0)
         _, examples = self._draw(_EXAMPLES, torch.Generator().manual_seed(0))
         self.region = Reachable((*low, *[-each for each in turns]), (*high, *turns), tuple(examples.ravel().tolist()))
@@ -83,12 +85,19 @@ class ReachableGoals:
             tries = max(_TRIES, 16 * left)
             draw = torch.rand(tries, len(self._lower), generator=generator, dtype=torch.float64).numpy()
             configurations = self._lower + (self._upper - self._lower) * draw
+            configurations = configurations[self._near(configurations)]
             goals = self._goals(configurations)
             allowed = self._allowed(configurations, goals)
             found.append((configurations[allowed], goals[allowed]))
             drawn += tries
         configurations, goals = (np.concatenate(arrays)[:rows] for arrays in zip(*found, strict=True))
         return configurations, goals
+
+    def _near(self, configurations: np.ndarray) -> np.ndarray:
+        """Whether the end effector is in the box or next to it, [N]: of most, nothing else needs to be known."""
+        tip = self._end_effector(configurations)
+        near: np.ndarray = np.all((tip >= self._low - _ROUNDING) & (tip <= self._high + _ROUNDING), axis=1)
+        return near
 
     def _allowed(self, configurations: np.ndarray, goals: np.ndarray) -> np.ndarray:
         allowed: np.ndarray = np.all((goals[:, :3] >= self._low) & (goals[:, :3] <= self._high), axis=1)

@@ -1,8 +1,13 @@
 """How commands end."""
 
+import io
 import signal
 import subprocess
 import sys
+
+import pytest
+
+from physai.cli import command as cli
 
 
 def test_what_nohup_started_goes_on_when_its_terminal_is_closed():
@@ -37,3 +42,15 @@ def test_a_reader_that_has_had_enough_ends_a_command_in_silence(tmp_path):
     process.stdout.close()
     assert process.stderr.read() == ""
     assert process.wait() == 128 + signal.SIGPIPE
+
+
+@pytest.mark.parametrize("terminal", [True, False])
+def test_a_terminal_shows_how_far_the_check_of_a_sweep_is(monkeypatch, terminal):
+    shown = io.StringIO()
+    shown.isatty = lambda: terminal
+    monkeypatch.setattr("sys.stderr", shown)
+    monkeypatch.setenv("TERM", "xterm")
+    combinations = [["seed=0"], ["seed=1"], ["seed=2"]]
+    assert list(cli._shown(combinations)) == combinations
+    assert ("checking 3 jobs" in shown.getvalue() and "67%" in shown.getvalue()) == terminal
+    assert bool(shown.getvalue()) == terminal
