@@ -21,6 +21,8 @@ from physai.errors import UserError
 _ROUNDING = 1e-5  # rad; of positions of single precision
 # s, in which a robot keeps a stance in the midst of its walk and can still walk on. To stand up anew would topple it.
 _PAUSE = 0.5
+_STIFF = 0.2  # s, for which it may be kept in the midst of a step; then it would lean too far to sink down upright
+_TO_A_STAND = 1.0  # s, after which a robot that was told to stand has no foot in the air
 
 
 class LeggedController(Controller):
@@ -30,10 +32,10 @@ class LeggedController(Controller):
     faster one than the policy was trained for counts as the fastest. A robot that begins to walk first stands up, in
     ``rise_time`` s.
 
-    What stands on legs must not simply stop. In a HOLD it keeps the positions that it was told last; after half a
-    second or less it walks on from there, after more it stands up first. In a FAULT and an emergency stop each joint is
-    told to be where it is: then only its damping is left, and the robot sinks down. To lean by more than ``max_tilt``
-    is a FAULT.
+    What stands on legs must not simply stop. In a HOLD it keeps the positions that it was told last. Where that is in
+    the midst of its walk, it does so for 0.2 s only, and walks on from there if it can. Then each joint is told to be
+    where it is, as in a FAULT and an emergency stop: only damping is left, and the robot sinks down upright, where its
+    stance would topple it. After a longer pause it stands up first. To lean by more than ``max_tilt`` is a FAULT.
 
     Args:
         policy: From :func:`physai.deploy.load_policy`, of a robot whose base floats.
@@ -59,6 +61,9 @@ class LeggedController(Controller):
         self._turn = _checked_turn(metadata)
         self._walked = self._risen = self._rise = 0.0
         self._drove = -math.inf  # when the policy last did; never, where that does not count any more
+        self._strode = -math.inf  # when it last was told to go somewhere
+        self._kept: float | None = None  # since when it has kept its stance
+        self._strides = False  # whether that is one of a walk
         self._start = metadata.home
         self._nothing = np.zeros(len(metadata.joints))
         self._last_action = self._nothing
@@ -193,6 +198,8 @@ class LeggedController(Controller):
         if not 0.0 <= age <= self.config.command_timeout:
             self._tell(reasons, "steps without a fresh command", f"the last command is {age:.1f} s old: it stands")
         elif self._risen >= self._rise:
+            if self._goal.any():
+                self._strode = self._now
             return self._goal
         else:
             reasons.append("it stands up")
@@ -212,10 +219,17 @@ class LeggedController(Controller):
         return np.clip(target, before - most, before + most)
 
     def _send(self, velocity: np.ndarray | None, elapsed: float, reasons: list[str]) -> np.ndarray | None:
-        if velocity is None and self._latched is not None:
-            return self._interface.give_way(self._robot.position)
+        now = self._now or 0.0
         if velocity is not None:
-            self._drove = self._now or 0.0
+            self._drove, self._kept = now, None
+        elif self._latched is not None:
+            self._strides = False
+            return self._interface.give_way(self._robot.position)
+        elif self._kept is None:
+            self._kept, self._strides = now, now - self._strode <= _TO_A_STAND
+        elif self._strides and not 0.0 <= now - self._kept <= _STIFF:
+            reasons.append("it sinks down: it was in the midst of a step")
+            return self._interface.give_way(self._robot.position)
         return super()._send(velocity, elapsed, reasons)
 
 
