@@ -55,6 +55,13 @@ def _watching(node: DictConfig) -> "WatchConfig":
     return shown
 
 
+# What processes that collect are made of.
+_COLLECTING = (
+    *("collector", "env", "physics", "randomization", "curriculum", "normalization"),
+    *("policy", "device", "threads", "allow"),
+)
+
+
 class Training:
     """Builds every part of a run, so that whatever is wrong shows before a run folder exists; then trains with them.
 
@@ -65,7 +72,7 @@ class Training:
     def __init__(self, keep: bool = False) -> None:
         self._keep = keep
         self._agent: Agent | None = None
-        self._checked: list[TrainConfig] = []
+        self._checked: set[str] = set()
 
     def check(self, node: DictConfig) -> None:
         """Build the parts; raises a UserError if one cannot be built. In a sweep, what was built once is not again."""
@@ -74,12 +81,15 @@ class Training:
         from physai.training.agent import Agent
 
         self.close()
+        if self._checked:
+            gc.collect()
         config = _config(node)
         _watching(node)
-        apart_from_seed = config.model_copy(update={"seed": 0})
+        apart_from_seed = repr(config.model_copy(update={"seed": 0}))
+        collecting = repr([getattr(config, name) for name in _COLLECTING])
         if apart_from_seed in self._checked:
             return
-        if any(config.collector == one.collector for one in self._checked):
+        if collecting in self._checked:
             config = config.model_copy(update={"collector": config.collector.smallest})
         self._agent = Agent.build(config)
         if config.export.formats:
@@ -88,7 +98,9 @@ class Training:
                 other_engine(config.env.physics)
         if not self._keep:
             self.close()
-            self._checked.append(apart_from_seed)
+            if not self._checked:
+                gc.freeze()  # what was imported: to look at it again takes a quarter of a second for each config
+            self._checked |= {apart_from_seed, collecting}
 
     def __reduce__(self) -> tuple[type, tuple[()]]:
         return Training, ()  # a job in another process builds its own
@@ -108,7 +120,6 @@ class Training:
             self._agent.close()
             self._agent = None
             gc.collect()  # its parts know each other, and the next config's are as many
-            gc.freeze()  # what is left was imported; to look at it again takes a quarter of a second for each config
 
 
 def _resume(run_dir: Path, given: list[str]) -> None:

@@ -114,7 +114,7 @@ def test_a_sweep_s_check_builds_nothing_for_another_seed_and_starts_a_collector_
     for value in ("seed=0", "seed=1", "algo.optimizer.lr=1e-3", "policy=gru", "collector.processes=2"):
         command.check(composed(*SMALL, "collector=async", value))
     started = [not isinstance(agent.collector, RobotCollector) for agent in built]
-    assert started == [True, False, False, True]
+    assert started == [True, False, True, True]
     with pytest.raises(UserError, match=r"seed"):
         command.check(composed(*SMALL, "collector=async", "seed=-1"))
     with pytest.raises(UserError, match=r"must be a multiple of collector\.processes \(3\)"):

@@ -177,13 +177,8 @@ def _check_all(
         would choose anew.
     """
     key = "hydra.sweep.dir" if sweep else "hydra.run.dir"
-    jobs: Iterable[DictConfig]
-    if sweep:
-        fixed = [str(one.input_line) for one in parse(given) if not one.is_sweep_override()]
-        combinations = _shown(list(_combinations(given)))
-        whole, jobs = compose(name, fixed, hydra=True), (compose(name, one, hydra=True) for one in combinations)
-    else:
-        jobs = [whole := compose(name, given, hydra=True)]
+    fixed = [str(one.input_line) for one in parse(given) if not (sweep and one.is_sweep_override())]
+    whole = compose(name, fixed, hydra=True)
     try:
         folder = str(OmegaConf.select(whole, key))
     except OmegaConfBaseException as error:
@@ -193,10 +188,12 @@ def _check_all(
         raise UserError(
             "hydra/launcher=submitit_slurm: there is no srun here, so this is no computer of a SLURM cluster"
         )
-    for config in jobs:
-        if sweep and launcher.endswith(".RayLauncher") and OmegaConf.select(config, "collector.ray_init"):
-            raise UserError("hydra/launcher=ray: a job of Ray's starts no other Ray: choose another collector")
-        check(OmegaConf.masked_copy(config, [key for key in config if key != "hydra"]))
+    with _shown(list(_combinations(given))) if sweep else contextlib.nullcontext([given]) as combinations:
+        for one in combinations:
+            config = compose(name, one, hydra=True) if sweep else whole
+            if sweep and launcher.endswith(".RayLauncher") and OmegaConf.select(config, "collector.ray_init"):
+                raise UserError("hydra/launcher=ray: a job of Ray's starts no other Ray: choose another collector")
+            check(OmegaConf.masked_copy(config, [key for key in config if key != "hydra"]))
     with read_write(whole.hydra):
         OmegaConf.update(whole, key, folder)
     if folder == ".":
@@ -211,7 +208,7 @@ def _check_all(
     if not os.access(folder, os.W_OK):
         raise UserError(f"cannot write to the run folder {folder}")
     pinned = [f"{key}='{folder}'"]
-    if sweep and whole.hydra.sweeper.max_batch_size is None:
+    if sweep and OmegaConf.select(whole, "hydra.sweeper.max_batch_size", default=0) is None:
         if launcher.endswith(".LocalLauncher"):  # submitit would start all jobs at once
             pinned.append(f"hydra.sweeper.max_batch_size={jobs_at_once(whole)}")
         elif launcher.endswith(".BasicLauncher"):  # Hydra would compose all jobs once more before it starts the first
@@ -219,15 +216,21 @@ def _check_all(
     return whole, pinned
 
 
-def _shown(combinations: list[list[str]]) -> Iterator[list[str]]:
-    """Show on a terminal how far the check of a sweep is."""
+@contextlib.contextmanager
+def _shown(combinations: list[list[str]]) -> Iterator[Iterable[list[str]]]:
+    """Context that shows on a terminal how far the check of a sweep is."""
     from rich.console import Console
     from rich.progress import Progress
 
-    # By itself it would take a thread for that, while the check forks.
-    bar = Progress(console=Console(stderr=True), auto_refresh=False, transient=True, disable=not sys.stderr.isatty())
-    with bar:
-        yield from bar.track(combinations, description=f"checking {len(combinations)} jobs")
+    with Progress(
+        console=Console(stderr=True),
+        auto_refresh=False,  # it would take a thread for that, while the check forks
+        redirect_stdout=False,
+        redirect_stderr=False,
+        transient=True,
+        disable=not sys.stderr.isatty(),
+    ) as bar:
+        yield bar.track(combinations, description=f"checking {len(combinations)} jobs")
 
 
 def _combinations(given: list[str]) -> Iterable[list[str]]:

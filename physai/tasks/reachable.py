@@ -85,11 +85,13 @@ class ReachableGoals:
             tries = max(_TRIES, 16 * left)
             draw = torch.rand(tries, len(self._lower), generator=generator, dtype=torch.float64).numpy()
             configurations = self._lower + (self._upper - self._lower) * draw
+            drawn += tries
             configurations = configurations[self._near(configurations)]
+            if not len(configurations):  # which SciPy did not take as rotations before 1.15
+                continue
             goals = self._goals(configurations)
             allowed = self._allowed(configurations, goals)
             found.append((configurations[allowed], goals[allowed]))
-            drawn += tries
         configurations, goals = (np.concatenate(arrays)[:rows] for arrays in zip(*found, strict=True))
         return configurations, goals
 

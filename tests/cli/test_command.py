@@ -8,6 +8,7 @@ import sys
 import pytest
 
 from physai.cli import command as cli
+from physai.errors import UserError
 
 
 def test_what_nohup_started_goes_on_when_its_terminal_is_closed():
@@ -51,6 +52,20 @@ def test_a_terminal_shows_how_far_the_check_of_a_sweep_is(monkeypatch, terminal)
     monkeypatch.setattr("sys.stderr", shown)
     monkeypatch.setenv("TERM", "xterm")
     combinations = [["seed=0"], ["seed=1"], ["seed=2"]]
-    assert list(cli._shown(combinations)) == combinations
+    seen = []
+
+    def check():
+        with cli._shown(combinations) as jobs:
+            for one in jobs:
+                seen.append(one)
+                if len(seen) == 3:
+                    raise UserError("bad")
+
+    with pytest.raises(UserError):
+        check()
+    assert seen == combinations
     assert ("checking 3 jobs" in shown.getvalue() and "67%" in shown.getvalue()) == terminal
     assert bool(shown.getvalue()) == terminal
+    before = shown.getvalue()
+    print("error: " + 100 * "bad ", file=sys.stderr)  # the bar is gone, and the line is whole
+    assert shown.getvalue() == before + "error: " + 100 * "bad " + "\n"

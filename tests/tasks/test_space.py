@@ -154,6 +154,26 @@ def test_poses_are_drawn_that_the_arm_takes_also_far_from_home(simulate):
     assert np.quantile(away, 0.9) > 2.0  # rad
 
 
+def test_goals_are_those_that_one_finds_without_a_look_at_where_the_tip_is_first(simulate, monkeypatch):
+    goals = simulate("panda_pose").task._goals
+    quick = [goals.sample(rows, generator(rows)) for rows in (1, 2, 200)]
+    monkeypatch.setattr(goals, "_near", lambda configurations: np.ones(len(configurations), bool))
+    for found in quick:
+        np.testing.assert_array_equal(found, goals.sample(len(found), generator(len(found))))
+
+
+def test_a_draw_of_which_nothing_leads_near_the_region_is_passed_over(simulate, monkeypatch):
+    goals, made, seen = simulate("panda_pose").task._goals, [], []
+    near, of_those = goals._near, goals._goals
+    monkeypatch.setattr("physai.tasks.reachable._TRIES", 16)
+    monkeypatch.setattr(goals, "_near", lambda drawn: made.append(near(drawn)) or made[-1])
+    monkeypatch.setattr(goals, "_goals", lambda drawn: seen.append(len(drawn)) or of_those(drawn))
+    for seed in range(20):
+        goals.sample(1, generator(seed))
+    assert 0 in map(np.count_nonzero, made)
+    assert 0 not in seen
+
+
 def test_a_policy_file_names_examples_of_goals_that_the_arm_reaches(simulate):
     region = simulate("panda_pose").task.region
     assert (region.kind, len(region.examples) % 7, region.sample(3, generator()).shape) == ("reachable", 0, (3, 7))

@@ -54,12 +54,12 @@ class WatchedCommands(JointCommands):
 
     @property
     def lost(self) -> bool:
-        """See :class:`JointCommands`; what stands still also goes past a watchdog that does not answer."""
+        """See :class:`JointCommands`; what stands still goes past a watchdog that is not there."""
         return self._past.unheard is not None and (not self._answering or self.unheard is not None)
 
     def send(self, command: Sequence[float]) -> None:
-        """Publish a command; while the watchdog does not answer, stop past it first."""
-        if time.monotonic() - self._last > self.timeout:
+        """Publish a command; while the watchdog does not answer, or does not listen, stop past it first."""
+        if time.monotonic() - self._last > self.timeout or self.unheard is not None:
             self._past.still = self.still
             self._past.stop()
         super().send(command)
