@@ -62,8 +62,8 @@ class LeggedController(Controller):
         self._walked = self._risen = self._rise = 0.0
         self._drove = -math.inf  # when the policy last did; never, where that does not count any more
         self._strode = -math.inf  # when it last was told to go somewhere
-        self._kept: float | None = None  # since when it has kept its stance
-        self._strides = False  # whether that is one of a walk
+        self._kept = -math.inf  # since when it has what it was told last
+        self._strides: bool | None = None  # whether it is paused in a walk; None while it is not paused
         self._start = metadata.home
         self._nothing = np.zeros(len(metadata.joints))
         self._last_action = self._nothing
@@ -221,12 +221,13 @@ class LeggedController(Controller):
     def _send(self, velocity: np.ndarray | None, elapsed: float, reasons: list[str]) -> np.ndarray | None:
         now = self._now or 0.0
         if velocity is not None:
-            self._drove, self._kept = now, None
+            self._drove = self._kept = now
+            self._strides = None
         elif self._latched is not None:
             self._strides = False
             return self._interface.give_way(self._robot.position)
-        elif self._kept is None:
-            self._kept, self._strides = now, now - self._strode <= _TO_A_STAND
+        elif self._strides is None:  # also if that is late: it may walk on with the next update
+            self._strides = self._kept - self._strode <= _TO_A_STAND
         elif self._strides and not 0.0 <= now - self._kept <= _STIFF:
             reasons.append("it sinks down: it was in the midst of a step")
             return self._interface.give_way(self._robot.position)
